@@ -124,6 +124,12 @@ def slow_drive(scene):
 
 
 @pytest.fixture(scope="session")
+def way(scene):
+    """Nineteen metres with a bend, a frame every 0.4 m."""
+    return small_world.record_along(scene, small_world.drive(10), 0.4)
+
+
+@pytest.fixture(scope="session")
 def elsewhere():
     """A run through another world."""
     return small_world.record(small_world.boxes(seed=77), frames=4)

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from coview_stream.errors import InputError
+from coview_stream.geometry.transforms import pose_from
 from coview_stream.localization.calibration.calibration import Calibration
 from coview_stream.localization.result import Fix
 from coview_stream.localization.saved_state import SavedState
@@ -33,9 +34,7 @@ class Robot(SavedState):
 
 
 def place(x):
-    T = np.eye(4)
-    T[0, 3] = x
-    return T
+    return pose_from(np.eye(3), [x, 0.0, 0.0])
 
 
 def test_pose_and_calibration_come_back(tmp_path):

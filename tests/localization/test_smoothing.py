@@ -1,7 +1,5 @@
 """Smoothing a recorded run: poses of frames that had none live, and none that the run does not speak for."""
 
-from __future__ import annotations
-
 import json
 from collections import Counter
 from dataclasses import dataclass
@@ -9,7 +7,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-import small_world
 from small_world import pose_error
 from trackers import garbage
 
@@ -70,17 +67,6 @@ def assert_right(poses, truth, metres=0.1):
         assert pose_error(pose.T_map_body, truth[k])[0] < metres, (k, pose.kind)
 
 
-@pytest.fixture(scope="module")
-def way(scene):
-    """A drive of 19 metres, a frame every 0.4 m."""
-    return small_world.record_along(scene, small_world.drive(10), 0.4)
-
-
-def jumped(odometry, at, metres=4.0):
-    """Odometry that begins anew at a frame, elsewhere and turned."""
-    return [T if k < at else pose_from(rot_z(0.9), [metres, 9.0, 0.0]) @ T for k, T in enumerate(odometry)]
-
-
 @pytest.mark.slow
 @pytest.mark.parametrize("late", ["clouds", "odometry"])
 def test_poses_are_of_the_stamp_where_clouds_or_odometry_are_late(world_map, way, late):
@@ -112,8 +98,10 @@ def test_frames_before_a_late_fix_are_tracked_backwards(world_map, way):
 
 @pytest.mark.slow
 def test_nothing_is_made_up_before_odometry_began_anew(world_map, way):
-    run = run_of(way.clouds, jumped(way.T_odom_body, 10))
-    _, poses = searched_from(world_map, run, 25)
+    """At the tenth frame, elsewhere and turned."""
+    anew = pose_from(rot_z(0.9), [4.0, 9.0, 0.0])
+    odometry = [*way.T_odom_body[:10], *(anew @ T for T in way.T_odom_body[10:])]
+    _, poses = searched_from(world_map, run_of(way.clouds, odometry), 25)
     found = by_frame(poses)
     assert min(found) >= 9
     assert PoseKind.BACKWARD in {pose.kind for pose in poses}

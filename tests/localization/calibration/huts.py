@@ -1,7 +1,5 @@
 """Sites of huts on open ground, 60 x 60 m."""
 
-from __future__ import annotations
-
 import numpy as np
 
 GROUND = np.stack(np.meshgrid(*[np.arange(-30, 30, 0.5)] * 2), axis=-1).reshape(-1, 2)

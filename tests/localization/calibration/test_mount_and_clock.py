@@ -1,7 +1,5 @@
 """Mount and clock as states: heading and lever arm of the sensor, and the delay between clouds and odometry."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from typing import NamedTuple
 

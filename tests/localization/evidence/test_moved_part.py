@@ -1,7 +1,5 @@
 """A part of what is seen that fits some metres beside the rest is found; what was merely replaced is not."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Places that a search might have scored, with probabilities of our choice, and votes that name chosen places."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

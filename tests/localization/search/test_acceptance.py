@@ -135,17 +135,13 @@ def test_reason_says_that_a_circle_was_searched_unless_there_is_a_pose():
     assert IN_CIRCLE not in found.evidence.reason
 
 
-def considered(x, probability):
-    T = pose_from(rot_z(0.5), [x, 2.0, 3.0])
-    return Hypothesis(T, 1, 1, score=0.5, ratio=7.0, probability=probability)
-
-
 def test_the_most_probable_come_first_in_the_frame_of_the_sources():
-    scored = Scored(Rivals(), [considered(float(k), 0.01 * k) for k in range(30)], none=0.25)
+    places = [
+        Hypothesis(pose_from(rot_z(0.5), [k, 2.0, 3.0]), 1, 1, score=0.5, ratio=7.0, probability=0.01 * k)
+        for k in range(30)
+    ]
+    scored = Scored(Rivals(), places, none=0.25)
     found = Considered.of(scored, search_request(4.0), np.array([1000.0, 0.0, 50.0]))
     assert (found.stamp, found.none, len(found.places)) == (4.0, 0.25, MAX_PLACES)
     assert np.allclose(found.places[0], [1029.0, 2.0, 53.0, 0.5, 0.29, 7.0])
-
-
-def test_no_place_is_nothing():
     assert Considered.of(Scored(Rivals(), []), search_request(), np.zeros(3)) is None

@@ -1,7 +1,5 @@
 """Advice to an ambiguous robot: the way to where the places that fit differ."""
 
-from __future__ import annotations
-
 from types import SimpleNamespace
 
 import numpy as np

@@ -24,7 +24,6 @@ from coview_stream.localization.state import State
 
 T_MAP_ODOM = pose_from(rot_z(1.9), [7.0, -3.0, 0.4])  # of the runs through the small world
 TILT = np.radians(4.0)
-SHARES = ("near", "covered", "ground", "free_space")
 TWIN = 192.0  # metres, whole tiles of the likelihood field, farther than a scan reaches
 
 
@@ -59,7 +58,7 @@ def off(T_map_odom):
     return np.linalg.norm((T_map_odom - T_MAP_ODOM)[:3, 3])
 
 
-@pytest.mark.parametrize("share", SHARES)
+@pytest.mark.parametrize("share", ["near", "covered", "ground", "free_space"])
 def test_every_evidence_share_but_the_surveyed_one_lowers_the_score(share):
     perfect = Evidence(1.0, 1.0, 1.0, 1.0, 1.0)
     assert perfect.score == replace(perfect, inside=0.1).score == 1.0

@@ -83,14 +83,12 @@ def test_hint_refers_to_the_next_frame(world_map, world_drive):
     assert tilt_of(T_map_odom) < 1e-9
 
 
-FARTHEST = pose_from(np.eye(3), [9.9e6, -9.9e6, 9.9e6])  # that is accepted
-
-
 @pytest.mark.slow
 @pytest.mark.parametrize("off", [None, BESIDE, pose_from(rot_z(np.pi), [0, 0, 0]), pose_from(np.eye(3), [900.0, 0, 0])])
 def test_wrong_hint_does_not_delay_the_fix(world_map, world_drive, world_fixes, off):
     localizer = Localizer(world_map)
-    localizer.hint_pose(FARTHEST if off is None else world_drive.T_map_body[0] @ off)
+    farthest = pose_from(np.eye(3), [9.9e6, -9.9e6, 9.9e6])  # that is accepted
+    localizer.hint_pose(farthest if off is None else world_drive.T_map_body[0] @ off)
     fixes = follow(localizer, world_drive, 4)
     assert first_fix(fixes) == first_fix(world_fixes)
     assert_usual(fixes, world_fixes, 1e-6)

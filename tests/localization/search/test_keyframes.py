@@ -168,13 +168,10 @@ def test_earlier_keyframes_are_read_as_they_were_by_the_newest_calibration():
         assert np.median(cKDTree(expected).query(submap)[0]) < 0.01
 
 
-T_LOCAL = pose_from(ODOM_FAR[:3, :3], np.zeros(3))
-
-
-def frames_of(drive, T_odom_map=T_LOCAL):
-    """Points and position of every frame in the odometry frame."""
+def frames_of(drive):
+    """Points and position of every frame in the odometry frame, about its origin."""
     for cloud, T in zip(drive.clouds, drive.T_map_body, strict=True):
-        T_odom_body = T_odom_map @ T
+        T_odom_body = pose_from(ODOM_FAR[:3, :3], np.zeros(3)) @ T
         yield transform(T_odom_body, cloud[::2]).astype(np.float32), T_odom_body[:3, 3]
 
 

@@ -65,21 +65,14 @@ def right(fixes, drive):
     return bool(posed) and all(metres < 0.3 and degrees < 1.0 for metres, degrees in errors)
 
 
-def test_auto_uses_both_recognizers_on_map_with_features(world_map, learned_map):
-    both, coview_only = search_of(learned_map), search_of(world_map)
-    assert both.coview is not None
-    assert both.learned is not None
+def test_auto_uses_both_recognizers_on_map_with_features_and_each_can_be_used_alone(world_map, learned_map):
+    both, alone = search_of(learned_map, peaks=2), search_of(learned_map, "learned")
     assert (both.spec.descriptor, both.spec.reach) == (learned_map.descriptor_config, 30.0)
-    assert coview_only.learned is None
-    assert coview_only.spec.reach is None
-
-
-def test_each_recognizer_can_be_used_alone(learned_map):
-    assert search_of(learned_map, "coview").learned is None
-    alone = search_of(learned_map, "learned")
-    assert alone.coview is None
-    assert alone.spec.descriptor is None
-    assert alone.last_query == {}
+    limits = [recognizer.consensus.config.peaks for recognizer in (both.learned, both.coview)]
+    assert limits == [2, LocalizerConfig().consensus.peaks]  # of hypotheses
+    assert (alone.coview, alone.spec.descriptor, alone.last_query) == (None, None, {})
+    for coview in (search_of(world_map), search_of(learned_map, "coview")):
+        assert (coview.learned, coview.spec.reach) == (None, None)
 
 
 def test_learned_recognizer_refuses_map_without_features(world_map):
@@ -87,11 +80,6 @@ def test_learned_recognizer_refuses_map_without_features(world_map):
         Localizer(world_map, LocalizerConfig(reloc="learned"))
     with pytest.raises(ConfigError, match="reloc is 'guesswork'"):
         LocalizerConfig(reloc="guesswork")
-
-
-def test_each_recognizer_has_its_own_limit_of_hypotheses(learned_map):
-    assert search_of(learned_map, peaks=2).learned.consensus.config.peaks == 2
-    assert search_of(learned_map, peaks=2).coview.consensus.config.peaks == LocalizerConfig().consensus.peaks
 
 
 def test_learned_recognizer_alone_localizes(learned_map, world_drive):

@@ -1,7 +1,5 @@
 """Modes of a place: posts in a row are as good a metre on, unless the row's end is seen."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np
@@ -100,10 +98,6 @@ def test_only_modes_within_the_place_count(row_map, points, monkeypatch):
     np.testing.assert_allclose(np.mean(started, axis=0), 0.0, atol=1e-9)
 
 
-def made_up(distances, probabilities) -> Modes:
-    return Modes(candidate(place(1.0)), np.array(distances), np.array(probabilities))
-
-
 @pytest.mark.parametrize(
     ("distances", "probabilities", "undecided"),
     [
@@ -115,4 +109,4 @@ def made_up(distances, probabilities) -> Modes:
     ],
 )
 def test_modes_elsewhere_count_together(distances, probabilities, undecided):
-    assert made_up(distances, probabilities).undecided == undecided
+    assert Modes(candidate(place(1.0)), np.array(distances), np.array(probabilities)).undecided == undecided

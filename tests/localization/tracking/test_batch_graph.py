@@ -2,17 +2,12 @@
 
 import numpy as np
 import pytest
+from se3 import exp_se3
 
 from coview_stream.geometry.transforms import exp_so3, log_se3, pose_from, relative
 from coview_stream.localization.tracking.batch_graph import BatchGraph, Constraint
 
 KERNEL = 3.0
-
-
-def scattered(rng, T, sigmas):
-    """A pose moved at random in its body's tangent."""
-    xi = rng.standard_normal(6) * sigmas
-    return T @ pose_from(exp_so3(xi[:3]), xi[3:])
 
 
 def random_graph(seed, nodes=24, loops=10, outliers=0.2):
@@ -31,13 +26,13 @@ def random_graph(seed, nodes=24, loops=10, outliers=0.2):
         T = truth[source] if target < 0 else relative(truth[target], truth[source])
         L = np.linalg.cholesky(covariance)
         xi = L @ rng.standard_normal(6) * (20.0 if off else 1.0)
-        return Constraint(source, target, T @ pose_from(exp_so3(xi[:3]), xi[3:]), covariance)
+        return Constraint(source, target, T @ exp_se3(xi), covariance)
 
     odometry = [measured(k, k - 1, spread(0.3), False) for k in range(1, nodes)]
     pairs = [(a, b) for a, b in rng.integers(0, nodes, (loops, 2)).tolist() if a != b]
     pairs += [(k, -1) for k in range(0, nodes, 5)]
     robust = [measured(a, b, spread(1.0), rng.random() < outliers) for a, b in pairs]
-    start = [scattered(rng, T, [0.02] * 3 + [0.3] * 3) for T in truth]
+    start = [T @ exp_se3(rng.standard_normal(6) * ([0.02] * 3 + [0.3] * 3)) for T in truth]
     return np.array(start), odometry, robust
 
 

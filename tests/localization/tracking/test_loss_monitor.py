@@ -1,7 +1,5 @@
 """The loss monitor: odds that the place is wrong, which add up against it a view at a time, and never for it."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import replace
 

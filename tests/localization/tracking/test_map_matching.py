@@ -1,7 +1,5 @@
 """Map matching: the match against the map alone, its rivals metres away, and its weight against odometry."""
 
-from __future__ import annotations
-
 from types import SimpleNamespace
 
 import numpy as np

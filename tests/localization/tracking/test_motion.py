@@ -1,7 +1,5 @@
 """Drift of odometry: its covariance, its estimate from registrations, and the registrations that teach it."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 
@@ -112,11 +110,10 @@ def test_turning_on_the_spot_updates_yaw_noise_only():
 
 
 SEEN = np.diag(np.square([0.002, 0.002, 0.002, 0.01, 0.01, 0.01]))
-STRAIGHT = np.eye(3)
 
 
 def at(x):
-    return pose_from(STRAIGHT, [x, 0.0, 0.0])
+    return pose_from(np.eye(3), [x, 0.0, 0.0])
 
 
 class Ride:

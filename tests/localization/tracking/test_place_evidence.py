@@ -1,7 +1,5 @@
 """Evidence of a tracked place: what was learned on the way is presumed, and what has changed speaks against it."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np
@@ -19,22 +17,12 @@ T_MAP_ODOM = pose_from(rot_z(1.3), [-4.0, 11.0, 0.6])
 @pytest.fixture(scope="module")
 def scans(world_drive):
     """The drive's first scans."""
-    return [scan_of(world_drive.clouds[k], world_drive.T_map_body[k]) for k in range(6)]
-
-
-def scan_of(cloud, truth) -> ObservedScan:
-    return observed(cloud, inverse(T_MAP_ODOM) @ truth)
+    return [observed(world_drive.clouds[k], inverse(T_MAP_ODOM) @ world_drive.T_map_body[k]) for k in range(6)]
 
 
 @pytest.fixture
 def place(world_map):
     return PlaceEvidence(world_map)
-
-
-def moved(scan, metres, degrees=0.0):
-    """The map <- odometry that puts the robot so far ahead of where it is."""
-    T_odom_body = scan.T_odom_body
-    return T_MAP_ODOM @ T_odom_body @ pose_from(rot_z(np.radians(degrees)), [metres, 0.0, 0.0]) @ inverse(T_odom_body)
 
 
 def fits_best_with(kept):
@@ -122,7 +110,9 @@ def test_place_holds_against_the_better_of_chance_and_its_rival():
 
 
 def test_ratios_are_those_of_observations_around_the_first(world_map, place, scans):
-    poses = np.stack([T_MAP_ODOM, moved(scans[1], 2.0)])
+    T_odom_body = scans[1].T_odom_body
+    ahead = T_MAP_ODOM @ T_odom_body @ pose_from(np.eye(3), [2.0, 0.0, 0.0]) @ inverse(T_odom_body)
+    poses = np.stack([T_MAP_ODOM, ahead])
     result = place.ratios(scans[1], poses)
     assert result[0] == pytest.approx(place.observe(scans[1], T_MAP_ODOM).ratio)
     assert result[1] < result[0]

@@ -1,7 +1,5 @@
 """Evidence of a slip: scans decide between where odometry leads and where they were registered, view by view."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from any_risk import NEVER, with_risk

@@ -10,7 +10,6 @@ from coview_stream.localization.calibration.calibration import RawScan
 from coview_stream.localization.calibration.estimator import CalibrationEstimator
 from coview_stream.localization.tracking.motion import ScanBuffer
 
-SETTINGS = TrackingConfig()
 NOTHING = np.zeros((20, 3), np.float32)
 GOOD = {"position_drift": 1e-3, "yaw_drift": 1e-4, "turn_drift": 1e-3}
 """Odometry that is never unsure before a metre is over."""
@@ -50,7 +49,7 @@ def test_back_and_forth_driving_adds_up(world_map):
 
 
 def test_turning_needs_registration_and_back_and_forth_adds_up(world_map):
-    turn = SETTINGS.turn
+    turn = TrackingConfig().turn
     assert steps_until_due(world_map, turning(turn * np.array([0.0, 0.4, 0.8, 1.2]))) == 3
     assert steps_until_due(world_map, turning(turn * np.array([0.0, 0.4, 0.0, 0.4]))) == 3
     assert steps_until_due(world_map, turning(turn * np.array([0.0, 0.9, 0.9, 0.9]))) is None

@@ -4,10 +4,12 @@ import numpy as np
 import pytest
 import small_world
 
+from coview_stream.geometry.transforms import pose_from
 from coview_stream.localization.localizer import Localizer
 from coview_stream.localization.tracking.monitor import RejectionReason
 from coview_stream.localization.witness.first_motions import Conventions
 
+pytestmark = pytest.mark.slow
 SENT = {
     "in feet": np.eye(3) / 0.3048,
     "in millimetres": np.eye(3) * 1e3,
@@ -30,14 +32,12 @@ def judged(drive, matrix=None, frames=99):
     return conventions
 
 
-@pytest.mark.slow
 def test_right_clouds_are_plausible_and_then_settled(drive):
     assert judged(drive, frames=5).plausible
     whole = judged(drive)
     assert (whole.finding, whole.settled) == (None, True)
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("name", SENT)
 def test_wrong_clouds_are_named_within_ten_metres_and_a_mirror_in_a_bend(drive, name):
     found = judged(drive, SENT[name], frames=99 if name == "left-handed" else 7)
@@ -45,7 +45,6 @@ def test_wrong_clouds_are_named_within_ten_metres_and_a_mirror_in_a_bend(drive, 
     assert not found.settled
 
 
-@pytest.mark.slow
 def test_each_of_two_readings_has_its_remedy(drive):
     found = judged(drive, np.array([[0.0, 1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]]), frames=4).finding
     first, second = found.split("; or else ")
@@ -54,7 +53,6 @@ def test_each_of_two_readings_has_its_remedy(drive):
     assert "--mount" in second
 
 
-@pytest.mark.slow
 def test_a_finding_goes_when_the_sender_is_mended(drive):
     conventions = judged(drive, SENT["y points forward"], frames=6)
     assert conventions.finding
@@ -63,20 +61,16 @@ def test_a_finding_goes_when_the_sender_is_mended(drive):
     assert conventions.finding is None
 
 
-@pytest.mark.slow
 def test_a_corridor_without_ends_shows_no_motion_along_it():
     x, y = (each.ravel() for each in np.meshgrid(np.arange(-20.0, 20.0, 0.2), np.arange(-2.0, 2.1, 0.2)))
     floor = np.column_stack([x, y, np.full(len(x), -1.7)])
     walls = [np.column_stack([x, np.full(len(x), side), y + 0.3]) for side in (-2.1, 2.1)]
     cloud, conventions = np.concatenate([floor, *walls]).astype(np.float32), Conventions()
     for k in range(4):
-        T = np.eye(4)
-        T[0, 3] = 1.2 * k
-        conventions.add(cloud, T)
+        conventions.add(cloud, pose_from(np.eye(3), [1.2 * k, 0.0, 0.0]))
     assert (conventions.finding, conventions.plausible) == (None, False)
 
 
-@pytest.mark.slow
 def test_rings_on_the_walls_of_a_corridor_raise_no_doubt():
     """They move with the sensor, so clouds seem to stand; but odometry's motion fits as well."""
     azimuth, up = (
@@ -89,14 +83,11 @@ def test_rings_on_the_walls_of_a_corridor_raise_no_doubt():
         to_floor = np.where(rays[:, 2] < 0.0, 0.8, 1.7) / np.abs(rays[:, 2])
         reach = np.minimum(to_wall, to_floor)
         cloud = rays * (reach + rng.normal(0.0, 0.015, len(rays)))[:, None]
-        T = np.eye(4)
-        T[:2, 3] = k, 0.2 * np.sin(k)
-        conventions.add(cloud[reach < 60.0].astype(np.float32), T)
+        conventions.add(cloud[reach < 60.0].astype(np.float32), pose_from(np.eye(3), [k, 0.2 * np.sin(k), 0.0]))
         assert not conventions.doubtful
     assert conventions.finding is None
 
 
-@pytest.mark.slow
 def test_the_localizer_names_it_and_gives_no_pose(world_map, drive):
     localizer = Localizer(world_map)
     for k, (cloud, T) in enumerate(zip(drive.clouds, drive.T_odom_body, strict=True)):
@@ -107,7 +98,6 @@ def test_the_localizer_names_it_and_gives_no_pose(world_map, drive):
             assert "y points forward" in fix.evidence.reason
 
 
-@pytest.mark.slow
 def test_nothing_that_was_sent_wrongly_is_searched_once_the_sender_is_mended(world_map, drive):
     localizer, first = Localizer(world_map), None
     for k, (cloud, T) in enumerate(zip(drive.clouds, drive.T_odom_body, strict=True)):

@@ -24,12 +24,6 @@ from coview_stream.localization.witness.witness import Witness
 BEGIN, DT = 18, 0.2  # frame of the fault; seconds, at two metres per second
 
 
-@pytest.fixture(scope="module")
-def way(scene):
-    """Nineteen metres with a bend, a frame every 0.4 m."""
-    return small_world.record_along(scene, small_world.drive(10), 0.4)
-
-
 def follow(world_map, way, clouds):
     """Return the fixes from the fault on, and the metres and degrees that the poses among them are off."""
     localizer, fixes, off = Localizer(world_map), [], []
