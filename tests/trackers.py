@@ -35,6 +35,16 @@ def assert_usual(fixes, usual, metres):
             np.testing.assert_allclose(fix.T_map_body, known.T_map_body, atol=metres)
 
 
+def assert_same(fix, other):
+    """Fail unless two fixes are one, but for rounding."""
+    assert fix.state is other.state
+    assert fix.stamp == other.stamp
+    assert (fix.T_map_body is None) == (other.T_map_body is None)
+    if fix.T_map_body is not None:
+        np.testing.assert_allclose(fix.T_map_body, other.T_map_body, atol=1e-6)
+        np.testing.assert_allclose(fix.covariance, other.covariance, rtol=1e-3, atol=1e-9)
+
+
 def registration(T_map_odom):
     return Registration(T_map_odom, 1e4 * np.eye(6), 0.05, 2000, 20, True)
 

@@ -15,6 +15,7 @@ import numpy as np
 import pytest
 from small_world import pose_error
 from sockets import until
+from trackers import assert_same
 
 from coview_stream import AsyncLocalizer, BaseMap, CloudError, CoViewError, InputError, PlaceGuess, RunError
 from coview_stream.localization.result import KeyframeEvidence
@@ -24,18 +25,6 @@ from coview_stream.stream.node.engine_queue import FrameResult
 from coview_stream.stream.node.engines import SearchEngine, TrackEngine
 
 WAIT = 120.0  # seconds, however slow the machine is
-
-
-def same(fix, other):
-    assert fix.state is other.state
-    assert fix.stamp == other.stamp
-    assert (fix.T_map_body is None) == (other.T_map_body is None)
-    if fix.T_map_body is not None:
-        np.testing.assert_allclose(fix.T_map_body, other.T_map_body, atol=1e-6)
-        np.testing.assert_allclose(fix.covariance, other.covariance, rtol=1e-3, atol=1e-9)
-
-
-# ---- without processes
 
 
 class Worked:
@@ -69,7 +58,7 @@ def worked(engines, world_drive):
 
 def test_frames_that_are_worked_on_have_the_fixes_of_a_localizer(worked, world_fixes):
     for k, fix in enumerate(world_fixes):
-        same(worked.step(k), fix)
+        assert_same(worked.step(k), fix)
 
 
 def test_fix_is_carried_on_by_odometry_until_it_is_too_old(worked, world_fixes):
@@ -205,9 +194,6 @@ def test_a_map_in_memory_is_refused(world_map):
         AsyncLocalizer(BaseMap(world_map.arrays, world_map.parameters))
 
 
-# ---- with processes
-
-
 @pytest.fixture(scope="module")
 def running(world_file):
     with AsyncLocalizer(world_file) as localizer:
@@ -234,7 +220,7 @@ def follow(localizer, drive, frames, start=0.0):
 @pytest.mark.slow
 def test_waited_for_it_gives_the_fixes_of_a_localizer(localizer, world_drive, world_fixes):
     for fix, other in zip(follow(localizer, world_drive, range(len(world_fixes))), world_fixes, strict=True):
-        same(fix, other)
+        assert_same(fix, other)
     assert localizer.state is State.TRACKING
     assert localizer.calibration == localizer.fix().calibration
     localizer.relocalize()
@@ -252,7 +238,7 @@ def test_useless_frames_and_hints_are_refused_and_change_nothing(localizer, worl
         localizer.guess_place(PlaceGuess(1e6, 0.0))
     with pytest.raises(RunError, match="T_map_body"):
         localizer.hint_pose(np.full((4, 4), np.nan))
-    same(follow(localizer, world_drive, [1])[0], world_fixes[1])
+    assert_same(follow(localizer, world_drive, [1])[0], world_fixes[1])
 
 
 @pytest.mark.slow

@@ -14,11 +14,9 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 from fake_node import Runner
-from fake_robot import tracking
 from sockets import until
 
 from coview_stream.basemap.basemap import BaseMap
-from coview_stream.localization.state import State
 from coview_stream.stream.node import engine_process
 from coview_stream.stream.node.engine_process import (
     CancelledError,
@@ -36,31 +34,16 @@ def job(points=None, robot="r1", stamp_ns=1_000_000_000):
     return FrameJob(robot, 1, stamp_ns, np.zeros((20, 3), np.float32) if points is None else points, np.eye(4))
 
 
-class Engine:
-    """Answers each job with a place, or fails with an error."""
-
-    def __init__(self, error=None):
-        self.error = error
-        self.forgotten = []
-
-    def run(self, job):
-        if self.error is not None:
-            raise self.error
-        return tracking(job)
-
-    def forget(self, robot):
-        self.forgotten.append(robot)
-
-
 def test_failed_engine_forgets_the_robot_and_returns_traceback():
-    engine = Engine(ZeroDivisionError("by nothing"))
+    def run(job):
+        raise ZeroDivisionError("by nothing")
+
+    forgotten = []
     with pytest.raises(FailedError) as caught:
-        Runner(engine).run(job(robot="r7"))
-    assert engine.forgotten == ["r7"]
+        Runner(SimpleNamespace(run=run, forget=forgotten.append)).run(job(robot="r7"))
+    assert forgotten == ["r7"]
     assert str(caught.value).strip().splitlines()[-1] == "ZeroDivisionError: by nothing"
     assert "Traceback" in str(caught.value)
-    engine.error = None
-    assert Runner(engine).run(job()).fix.state is State.TRACKING
 
 
 @pytest.fixture
@@ -217,9 +200,6 @@ def test_close_ends_a_running_job(engine):
     for again in (process.watch, lambda: process.run(job())):
         with pytest.raises(DiedError, match="closed"):
             again()
-
-
-# ---- the child
 
 
 @pytest.mark.parametrize(("cores", "threads"), [(1, "1"), (2, "1"), (8, "7")])

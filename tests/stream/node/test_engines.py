@@ -6,7 +6,7 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from trackers import follow
+from trackers import assert_same, follow
 
 import coview_kernels
 from coview_kernels import runtime
@@ -146,14 +146,6 @@ def test_prepared_localizer_compiles_no_kernel_later(world_file, world_drive, la
     assert launched <= prepared
 
 
-def same(fix, other):
-    assert fix.state is other.state
-    assert (fix.T_map_body is None) == (other.T_map_body is None)
-    if fix.T_map_body is not None:
-        np.testing.assert_allclose(fix.T_map_body, other.T_map_body, atol=1e-6)
-        np.testing.assert_allclose(fix.covariance, other.covariance, rtol=1e-3, atol=1e-9)
-
-
 def test_track_and_search_engines_equal_localizer_one_frame_late(reference, world_fixes):
     first = next(k for k, fix in enumerate(world_fixes) if fix.state is State.TRACKING)
     assert first + 1 < FRAMES
@@ -162,7 +154,7 @@ def test_track_and_search_engines_equal_localizer_one_frame_late(reference, worl
         assert reference.fixes[k].state is world_fixes[k - 1].state
         assert reference.fixes[k].T_map_body is None
     for k in range(first + 1, FRAMES):
-        same(reference.fixes[k], world_fixes[k])
+        assert_same(reference.fixes[k], world_fixes[k])
 
 
 @pytest.mark.slow
@@ -173,7 +165,7 @@ def test_two_robots_give_same_results_as_each_alone(engines, reference, world_dr
         one.follow(world_drive, [k])
         two.follow(other_drive, [k])
     for here, there, undisturbed in zip(one.fixes, two.fixes, reference.fixes, strict=True):
-        same(here, undisturbed)
+        assert_same(here, undisturbed)
         assert there.state is undisturbed.state
         if there.T_map_body is not None:
             np.testing.assert_allclose(there.T_map_body, undisturbed.T_map_body, atol=0.02)
@@ -205,7 +197,7 @@ def test_frames_that_are_rejected_change_nothing_and_what_comes_with_them_is_app
     assert sum(events["plain"], ())[-2:] == (Event.VERIFICATION_REQUIRED, Event.MATCH_VERIFIED)
     assert Event.PLACE_ACCEPTED in sum(events["plain"], ())
     for fix, undisturbed in zip(careless.fixes, plain.fixes, strict=True):
-        same(fix, undisturbed)
+        assert_same(fix, undisturbed)
 
 
 def test_new_epoch_resets_both_engines(engines, reference, world_drive):

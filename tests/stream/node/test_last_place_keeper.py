@@ -35,9 +35,6 @@ def jobs_of(robot, count=3, answer=unknown, begin=0.1):
     return [robot.frame(begin + 0.1 * k, answer).hint for k in range(count)]
 
 
-# ---- a session
-
-
 def test_pose_hint_goes_with_one_frame_and_so_does_its_calibration(robot):
     known = Calibration(pitch=0.05)
     robot.session.offer(LastPlace(SHA, 5, BEFORE, calibration=known))
@@ -138,9 +135,6 @@ def test_last_known_pose_is_the_newest(robot):
     assert robot.session.last_place() is None
 
 
-# ---- the engine
-
-
 def test_pose_hint_reaches_the_localizer(world_map, world_drive):
     engine = TrackEngine(world_map)
 
@@ -151,9 +145,6 @@ def test_pose_hint_reaches_the_localizer(world_map, world_drive):
     assert [len(hints(0, world_drive.T_map_body[0])), len(hints(1)), len(hints(2))] == [1, 1, 1]
     engine.forget("r1")
     assert hints(0, pose_from(np.eye(3), [1e9, 0.0, 0.0])) == ()  # the hint is of no use, but the frame is
-
-
-# ---- the node
 
 
 def remembering(folder, *names, **more):

@@ -50,14 +50,10 @@ def save(world_map, folder, key, **more):
     return BaseMap(world_map.arrays, world_map.parameters | more).save(folder / "site.coview", signing)
 
 
-def options_of(site):
-    verify = read_verify_key(site / "ours.pub")
-    return serve.ServeOptions(site / "site.coview", KEYS, verify_key=verify)
-
-
 @pytest.mark.parametrize(("key", "said"), [(None, "not signed"), ("theirs", "another key")])
 def test_reload_obeys_the_key_of_the_start(site, world_map, key, said):
-    options, served = options_of(site), BaseMap.load(site / "site.coview").sha256
+    path, verify_key = site / "site.coview", read_verify_key(site / "ours.pub")
+    options, served = serve.ServeOptions(path, KEYS, verify_key=verify_key), BaseMap.load(path).sha256
     assert serve.open_map(options, served, lambda: False) is None
     (site / "theirs.pub").replace(site / "ours.pub")  # the key is that of the start, whatever its file holds now
     save(world_map, site, key, crs="another")

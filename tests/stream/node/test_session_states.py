@@ -135,16 +135,6 @@ def test_odometry_gap_during_first_fix_restarts_search(robot):
     assert robot.job_for(2.05).epoch > busy.epoch  # the search begins anew
 
 
-@pytest.fixture
-def covered():
-    """A robot whose sensor has been covered after it was found."""
-    robot = Robot().localized(0.0)
-    robot.frame(0.1, doubted)
-    assert robot.session.state() == (State.DOUBTED, "only 0 points to register")
-    assert robot.session.pose() is None
-    return robot
-
-
 def told(robot):
     document = status(robot.session, Connection((), ()), 0, 0.0, 1.0)
     return json.loads(json.dumps(document))["transitions"]
@@ -155,22 +145,24 @@ def changes(robot):
 
 
 @pytest.mark.parametrize("noticed", [False, True])
-def test_odometry_pause_while_doubted_keeps_the_place(covered, noticed):
-    epoch = covered.frame(0.2, doubted).epoch
+def test_odometry_pause_while_doubted_keeps_the_place(robot, noticed):
+    epoch = robot.localized(0.0).frame(0.2, doubted).epoch
+    assert robot.session.state() == (State.DOUBTED, "only 0 points to register")
+    assert robot.session.pose() is None
     if noticed:
-        covered.session.tick(covered.now + 0.4)
-        assert state(covered) is State.DOUBTED
-        covered.session.tick(covered.now + 0.6)
-        assert changes(covered)[-1] == ("AMBIGUOUS", "LOST", "no odometry for 0.5 s")
-    covered.moved(0.9, x=0.4)
-    assert covered.counters.odometry_gaps == 1
-    assert state(covered) is (State.LOST if noticed else State.DOUBTED)
-    covered.moved(1.0, x=0.5)
-    covered.saw(0.95)
-    job = covered.answered()
+        robot.session.tick(robot.now + 0.4)
+        assert state(robot) is State.DOUBTED
+        robot.session.tick(robot.now + 0.6)
+        assert changes(robot)[-1] == ("AMBIGUOUS", "LOST", "no odometry for 0.5 s")
+    robot.moved(0.9, x=0.4)
+    assert robot.counters.odometry_gaps == 1
+    assert state(robot) is (State.LOST if noticed else State.DOUBTED)
+    robot.moved(1.0, x=0.5)
+    robot.saw(0.95)
+    job = robot.answered()
     assert (job.epoch, job.require_verification) == (epoch, True)
-    assert covered.session.pose() is not None
-    assert covered.counters.losses == noticed
+    assert robot.session.pose() is not None
+    assert robot.counters.losses == noticed
 
 
 @pytest.mark.parametrize("answer", [tracking, doubted])

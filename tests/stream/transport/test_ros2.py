@@ -583,9 +583,6 @@ def test_launch_file_and_parameters_of_the_example_are_right(tmp_path):
     assert (float(args.risk), args.state) == (1e-4, None)  # the user's own folder
 
 
-# ---- a process of its own
-
-
 class Served:
     """``coview-stream serve`` in a process."""
 
