@@ -1,4 +1,4 @@
-"""Messages from bytes and back: one table of codecs for each kind of message.
+"""Decoding and encoding of messages: one table of codecs for each kind.
 
 ============  ===========================================  ===================================================
 codec         in                                           out
@@ -14,8 +14,8 @@ codec         in                                           out
 
 Stamps are nanoseconds of the sensor's clock, lengths metres; poses are 4x4, odometry <- body or map <- body.
 For any bytes, decoding returns a message or raises :class:`MessageError` (:class:`OversizedError` if too large,
-:class:`EncodingError` if no codec knows the encoding or can carry this kind of message). An ``option`` or ``hint``
-that names no codec for this kind of message is a :class:`ConfigError`.
+:class:`EncodingError` if no codec knows the encoding or supports this kind of message). An ``option`` or ``hint``
+that is not a codec for this kind of message raises :class:`ConfigError`.
 """
 
 from __future__ import annotations
@@ -60,7 +60,7 @@ C = TypeVar("C")
 
 
 class Codec(NamedTuple, Generic[M]):
-    """One encoding of one kind of message: the function that reads a sample, and the one that writes a message."""
+    """One encoding for one kind of message: a function that reads a sample, and one that writes a message."""
 
     decode: Callable[[Sample], M]
     encode: Callable[[M], Encoded]
@@ -119,22 +119,22 @@ def decode_pose(sample: Sample, option: str | None = None, hint: str | None = No
 
 
 def encode_cloud(message: CloudMessage, name: str) -> Encoded:
-    """Write a lidar frame by the codec ``name`` of :data:`CLOUD_CODECS`."""
+    """Write a lidar frame with codec ``name`` of :data:`CLOUD_CODECS`."""
     return _named("cloud", CLOUD_CODECS, name).encode(message)
 
 
 def encode_odometry(message: OdometryMessage, name: str) -> Encoded:
-    """Write an odometry sample by the codec ``name`` of :data:`ODOMETRY_CODECS`."""
+    """Write an odometry sample with codec ``name`` of :data:`ODOMETRY_CODECS`."""
     return _named("odometry", ODOMETRY_CODECS, name).encode(message)
 
 
 def encode_pose(message: PoseMessage, name: str) -> Encoded:
-    """Write a pose by the codec ``name`` of :data:`POSE_CODECS`; JSON refuses NaN (MessageError)."""
+    """Write a pose with codec ``name`` of :data:`POSE_CODECS`; JSON refuses NaN (MessageError)."""
     return _named("pose", POSE_CODECS, name).encode(message)
 
 
 def encode_location(message: LocationMessage, name: str) -> Encoded:
-    """Write a location by the codec ``name`` of :data:`LOCATION_CODECS`; locations are written only."""
+    """Write a location with codec ``name`` of :data:`LOCATION_CODECS`; locations cannot be read."""
     return _named("locations", LOCATION_CODECS, name)(message)
 
 

@@ -1,4 +1,4 @@
-"""Choice of the codec that reads a sample: option > Encoding > key > hint of the preset > first bytes."""
+"""Choice of the codec for a sample: option > Encoding > key > the preset's hint > first bytes."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from coview_stream.messages.types import Sample
 
 MessageKind = Literal["cloud", "odometry", "pose"]
 
-# codecs of a MIME type; the first one if no schema is named
+# codecs for a MIME type; the first one if no schema is named
 _MIMES: dict[str, tuple[str, ...]] = {
     "": (),
     "application/octet-stream": ("xyz", "xyzi"),
@@ -25,7 +25,7 @@ _MIMES: dict[str, tuple[str, ...]] = {
     "text/json": ("json",),
 }
 _MUTE = ("", "application/octet-stream", "zenoh/bytes", "zenoh/string")  # meaningless without a schema
-_WITHOUT_SCHEMA = ("application/json", "text/json")  # parameters are a charset or the like
+_WITHOUT_SCHEMA = ("application/json", "text/json")  # parameters are a charset or similar
 _LIVOX = ("livox_ros_driver2", "livox_ros_driver", "livox_interfaces")
 _SCHEMAS: dict[str, tuple[str, tuple[MessageKind, ...]]] = {
     "xyz": ("xyz", ("cloud",)),
@@ -40,7 +40,7 @@ _SCHEMAS: dict[str, tuple[str, tuple[MessageKind, ...]]] = {
     "core.envelope": ("keelson", ("cloud", "odometry", "pose")),
 }
 _KEELSON: dict[str, tuple[MessageKind, ...]] = {"point_cloud": ("cloud",), "frame_transform": ("odometry", "pose")}
-# CDR: two bytes of encoding, two of options (padding at the end); the codec refuses XCDR2 by name
+# CDR: two bytes of encoding, two of options (padding at the end); the codec names XCDR2 when it refuses it
 _MAGIC = re.compile(rb"(?P<cdr>\0[\0\1\6-\x0b]\0[\0-\3])|(?P<json>\{)")
 _RMW_KEY = re.compile(r"/([^/]+::msg::dds_::[^/]+_)/[^/]+$")
 _KEELSON_KEY = re.compile(r"/@v0/.*pubsub/([^/]+)/")
@@ -48,7 +48,7 @@ _MAX_ENCODING = 256  # characters
 
 
 def codec_for(kind: MessageKind, names: Collection[str], sample: Sample, option: str | None, hint: str | None) -> str:
-    """Choose one of the codecs ``names``; ConfigError for an unknown option or hint, EncodingError if none fits."""
+    """Choose among the codecs ``names``; ConfigError for an unknown option or hint, EncodingError if none fits."""
     for setting, name in (("option", option), ("hint", hint)):
         if name is not None and name not in names:
             raise ConfigError(f"encoding {setting} {name!r} for {kind}; it must be one of {', '.join(names)}")
@@ -73,7 +73,7 @@ def codec_for(kind: MessageKind, names: Collection[str], sample: Sample, option:
 
 @lru_cache(maxsize=256)
 def _claims(kind: MessageKind, encoding: str, key: str) -> tuple[tuple[str, ...], str]:
-    """Return the codecs that the encoding allows, best first (empty: any), and the codec of the key or ''."""
+    """Return the codecs that the encoding allows, best first (empty: any), and the key's codec or ''."""
     mime, _, parameters = encoding.partition(";")
     mime = mime.strip().lower()
     if len(encoding) > _MAX_ENCODING or mime not in _MIMES:

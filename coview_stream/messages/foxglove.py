@@ -1,8 +1,8 @@
 """Foxglove's protobuf schemas: PointCloud, PoseInFrame, FrameTransform and LocationFix.
 
-The top level of a message is split by our own parser of the wire format, with every size checked. The schema classes
-would copy a cloud's data once more, and build an object for each of the millions of empty fields that a hostile
-payload can announce.
+Our own parser of the wire format splits the top level of a message and checks every size. The schema classes would
+copy a cloud's data once more, and build an object for each of the millions of empty fields that a hostile payload can
+announce.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ _KINDS = {1: "<u1", 2: "<i1", 3: "<u2", 4: "<i2", 5: "<u4", 6: "<i4", 7: "<f4", 
 _NUMBERS = {kind: number for number, kind in _KINDS.items()}
 _DATA = 6  # number of PointCloud.data
 _ROTATION = 5  # number of FrameTransform.rotation; PoseInFrame has fewer fields
-_LENGTH, _FIXED = 2, {1: 8, 5: 4}  # wire types: with a length, of fixed sizes
+_LENGTH, _FIXED = 2, {1: 8, 5: 4}  # wire types: with a length, and of fixed size
 
 
 class Entry(NamedTuple):
@@ -35,12 +35,12 @@ class Entry(NamedTuple):
     number: int
     sized: bool  # a length precedes the value
     start: int  # of the tag
-    value: int  # after its length
+    value: int  # after the length
     end: int
 
 
 def wire_entries(payload: bytes | memoryview, limit: int) -> list[Entry]:
-    """List the top-level fields in order; MessageError if they overrun the payload or are more than ``limit``."""
+    """List the top-level fields in order; MessageError if they overrun the payload or exceed ``limit``."""
     fields: list[Entry] = []
     position = 0
     while position < len(payload):
@@ -75,7 +75,7 @@ def _varint(payload: bytes | memoryview, position: int) -> tuple[int, int]:
 
 
 def split_field(payload: bytes | memoryview, number: int, limit: int) -> tuple[bytes, memoryview]:
-    """Return a message without the sized field ``number``, and a view on that field's last value."""
+    """Return a message without the sized field ``number``, and a view of that field's last value."""
     view = memoryview(payload)
     rest: list[memoryview] = []
     value = view[:0]
@@ -88,7 +88,7 @@ def split_field(payload: bytes | memoryview, number: int, limit: int) -> tuple[b
 
 
 def sized_field(number: int, value: bytes) -> bytes:
-    """Write a field of bytes or of a nested message."""
+    """Encode a field of bytes or a nested message."""
     return _packed(number << 3 | _LENGTH) + _packed(len(value)) + value
 
 
@@ -102,7 +102,7 @@ def _packed(value: int) -> bytes:
 
 
 def wire_timestamp(seconds: int, nanos: int) -> bytes:
-    """Write a google.protobuf.Timestamp; varints have 64 bits, negative ones in two's complement."""
+    """Encode a google.protobuf.Timestamp; varints have 64 bits, negative values in two's complement."""
     return b"\x08" + _packed(seconds % 2**64) + b"\x10" + _packed(nanos)
 
 
@@ -135,7 +135,7 @@ def _pose(p: Any, q: Any) -> Pose:
 
 
 def read_cloud(payload: bytes | memoryview) -> CloudMessage:
-    """Read a PointCloud and apply its ``pose``, if set; packed points without a pose stay a view."""
+    """Read a PointCloud and apply its ``pose``, if set; packed points without a pose remain a view."""
     head, data = split_field(payload, _DATA, MAX_FIELDS)
     cloud = _parse(schemas().PointCloud, head)
     fields = tuple((f.name, _KINDS[f.type], f.offset) for f in cloud.fields if f.type in _KINDS)
@@ -179,7 +179,7 @@ def decode_pose(sample: Sample) -> PoseMessage:
 
 
 def write_cloud(message: CloudMessage, frame_id: str = "base_link") -> bytes:
-    """Write a PointCloud without a pose: the points are in the body frame already."""
+    """Write a PointCloud without a pose: the points are already in the body frame."""
     table = write_table(message)
     cloud = schemas().PointCloud(frame_id=frame_id, point_stride=table.step)
     cloud.timestamp.seconds, cloud.timestamp.nanos = stamp_split(message.stamp_ns)

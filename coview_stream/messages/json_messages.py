@@ -1,6 +1,6 @@
 """JSON odometry, poses, statuses, hypotheses and locations.
 
-Reading is strict: every value is checked, a MessageError names the field, and extra fields are ignored.
+Reading is strict: every value is checked, a MessageError names the field; extra fields are ignored.
 """
 
 from __future__ import annotations
@@ -38,12 +38,12 @@ def decode_odometry(sample: Sample) -> OdometryMessage:
 
 
 def encode_odometry(message: OdometryMessage) -> Encoded:
-    """Write odometry in the form that :func:`decode_odometry` reads."""
+    """Write odometry as :func:`decode_odometry` reads it."""
     return _dump({"stamp_ns": int(message.stamp_ns), **place_fields(message.T_odom_body)}, "pose")
 
 
 def decode_pose(sample: Sample) -> PoseMessage:
-    """Read a pose in the form that :func:`encode_pose` writes; fields after ``map_sha256`` are optional."""
+    """Read a pose written by :func:`encode_pose`; fields after ``map_sha256`` are optional."""
     fields = read_object(sample.payload)
     return PoseMessage(
         stamp_ns=stamp_from(fields.get("stamp_ns")),
@@ -61,12 +61,12 @@ def decode_pose(sample: Sample) -> PoseMessage:
 
 
 def encode_pose(message: PoseMessage) -> Encoded:
-    """Write a pose with its covariance row by row, (x, y, z, roll, pitch, yaw).
+    """Write a pose with its covariance row by row (x, y, z, roll, pitch, yaw).
 
-    ``protection_level`` and ``T_map_odom`` (position and orientation, map <- odometry) are null where unknown.
-    NaN is a MessageError.
+    ``protection_level`` and ``T_map_odom`` (position and orientation, map <- odometry) are null if unknown. NaN is a
+    MessageError.
     """
-    fields = message.to_json() | {  # NaN stays, to be refused
+    fields = message.to_json() | {  # NaN stays in, to be refused
         "covariance": np.asarray(message.covariance, dtype=np.float64).ravel().tolist(),
         "confidence": float(message.confidence),
         "map_sha256": message.map_sha256,
@@ -76,9 +76,9 @@ def encode_pose(message: PoseMessage) -> Encoded:
 
 
 def pose_record(pose: PoseMessage, sample: Sample) -> dict[str, Any]:
-    """Return a pose's fields as in the native JSON, null where the pose's format lacks one.
+    """Return a pose's fields as in the native JSON, null where its format lacks one.
 
-    A JSON sample is returned unchanged, including fields that a newer node added.
+    A JSON sample is returned unchanged, with any fields that a newer node added.
     """
     if sample.payload[:1] == b"{":
         return read_object(sample.payload)
@@ -86,7 +86,7 @@ def pose_record(pose: PoseMessage, sample: Sample) -> dict[str, Any]:
 
 
 def read_status(sample: Sample) -> dict[str, Any]:
-    """Read a node's status, a JSON object without required fields; MessageError if it is no object."""
+    """Read a node's status, a JSON object without required fields; MessageError if it is not an object."""
     try:
         return read_object(sample.payload, _MAX_STATUS_BYTES)
     except MessageError as error:
@@ -106,7 +106,7 @@ def encode_hypotheses(message: HypothesesMessage) -> Encoded:
 
 
 def decode_hypotheses(sample: Sample) -> HypothesesMessage:
-    """Read hypotheses in the form that :func:`encode_hypotheses` writes; a MessageError names the wrong field."""
+    """Read hypotheses written by :func:`encode_hypotheses`; a MessageError names the wrong field."""
     try:
         fields = read_object(sample.payload, _MAX_HYPOTHESES_BYTES)
         rows = fields.get("places")
@@ -163,7 +163,7 @@ def number(value: object, name: str) -> float:
     try:
         if isinstance(value, int | float) and not isinstance(value, bool) and math.isfinite(value):
             return float(value)
-    except OverflowError:  # an integer beyond the floats
+    except OverflowError:  # an integer too large for a float
         pass
     raise MessageError(f"{name}: not a finite number")
 
@@ -177,7 +177,7 @@ def numbers(fields: dict[str, Any], name: str, count: int) -> list[float]:
 
 
 def text(fields: dict[str, Any], name: str, default: str | None = None) -> str:
-    """Return field ``name``, a text that can be written as UTF-8."""
+    """Return field ``name``, a text that UTF-8 can encode."""
     value = fields.get(name, default)
     if not isinstance(value, str) or any("\ud800" <= letter <= "\udfff" for letter in value):
         raise MessageError(f"{name}: write a text")

@@ -1,4 +1,4 @@
-"""Keelson (RISE, maritime): a ``core.Envelope`` around one of Foxglove's messages.
+"""Keelson (RISE, maritime): a ``core.Envelope`` around a Foxglove message.
 
 Field 1 of the envelope is ``enclosed_at`` (google.protobuf.Timestamp), field 2 ``payload`` (bytes). Only the inner
 message's stamp is used: ``enclosed_at`` is not a sensor time.
@@ -26,7 +26,7 @@ def _open(envelope: bytes) -> memoryview:
 
 
 def _close(stamp_ns: int, payload: bytes) -> Encoded:
-    """Write an envelope; it carries the sensor's time because a codec has no clock."""
+    """Write an envelope with the sensor's time, because a codec has no clock."""
     enclosed_at = wire_timestamp(*stamp_split(stamp_ns))
     envelope = sized_field(_ENCLOSED_AT, enclosed_at) + sized_field(_PAYLOAD, payload)
     return Encoded(envelope, _ENCODING)

@@ -1,9 +1,9 @@
-"""Livox' own clouds, ``CustomMsg`` of livox_ros_driver, livox_ros_driver2 and livox_interfaces, from CDR.
+"""Livox clouds in CDR: ``CustomMsg`` of livox_ros_driver, livox_ros_driver2 and livox_interfaces.
 
     header, uint64 timebase, uint32 point_num, uint8 lidar_id, uint8[3] rsvd, CustomPoint[] points
     CustomPoint: uint32 offset_time (ns after the stamp), float32 x y z, uint8 reflectivity tag line
 
-The points are read as a table: an object for each of 20,000 a frame would take longer than the frame.
+The points are read as a table: 20,000 objects a frame would take longer than the frame.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ _HEAD = 20  # bytes from the time base to the first point
 
 
 def _layout(payload: bytes) -> tuple[str, int, int] | None:
-    """Return byte order, offset of the first point and number of points; None if it is another message."""
+    """Return byte order, offset of the first point and number of points; None for another message."""
     if payload[:2] not in (b"\0\0", b"\0\1") or len(payload) < 16:
         return None
     order = "<" if payload[1] else ">"
@@ -39,12 +39,12 @@ def _layout(payload: bytes) -> tuple[str, int, int] | None:
 
 
 def is_custom(payload: bytes) -> bool:
-    """Return whether a message in CDR is a CustomMsg: its counts agree with each other and with its size."""
+    """Whether a CDR message is a CustomMsg: its counts agree with each other and with its size."""
     return _layout(payload) is not None
 
 
 def decode(payload: bytes) -> CloudMessage:
-    """Read a cloud; MessageError if it is none."""
+    """Read a cloud; MessageError if it is not one."""
     layout = _layout(payload)
     if layout is None:
         raise MessageError(f"not a {TYPES[0]} in CDR: truncated, or another message")
@@ -56,7 +56,7 @@ def decode(payload: bytes) -> CloudMessage:
 
 
 def cdr_from_ros1(data: bytes) -> bytes:
-    """Return a CustomMsg of ROS 1 in CDR, little-endian; MessageError if it is truncated."""
+    """Convert a ROS 1 CustomMsg to CDR, little-endian; MessageError if it is truncated."""
     try:
         _, sec, nanosec, length = struct.unpack_from("<4I", data)
         at = 16 + length

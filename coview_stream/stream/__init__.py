@@ -1,1 +1,1 @@
-"""Zenoh frames in, map-frame poses out. Threads, clocks and processes live here and nowhere else."""
+"""Frames arrive over zenoh, poses in the map frame leave. Only this package has threads, clocks and processes."""

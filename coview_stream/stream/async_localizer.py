@@ -1,4 +1,4 @@
-"""A localizer whose calls never wait: the engines of a node, tracking and search, in processes of their own."""
+"""A localizer whose calls never wait: the tracking and search engines of a node run in their own processes."""
 
 from __future__ import annotations
 
@@ -44,8 +44,8 @@ from coview_stream.stream.node.inputs import PairedFrame
 from coview_stream.stream.transport.error_guard import RateLimitedErrors
 
 _NAME = "the robot"
-_MAX_UNSEEN = 5.0  # seconds by odometry alone, as NodeConfig.dead_reckoning_timeout
-_STEP = 0.05  # seconds between two looks at engines that are not ready
+_MAX_UNSEEN = 5.0  # seconds on odometry alone, as NodeConfig.dead_reckoning_timeout
+_STEP = 0.05  # seconds between checks of engines that are not ready
 _CLOSE_TIMEOUT = 1.0  # seconds for the threads to end
 
 log = logging.getLogger("coview_stream")
@@ -54,15 +54,15 @@ log = logging.getLogger("coview_stream")
 class AsyncLocalizer(SavedState):
     """A localizer whose calls never wait: search and registration run in child processes.
 
-    Two of them do the work of a :class:`~coview_stream.localization.localizer.Localizer`, one the searches, one the
-    rest. Both map the map's file into memory, and both are new interpreters: the script needs no ``__main__`` guard.
-    :meth:`step` hands over a frame and returns the newest pose that is known, carried on to that frame by odometry.
+    Two processes do the work of a :class:`~coview_stream.localization.localizer.Localizer`: one searches, the other
+    does the rest. Both memory-map the map file. They are new interpreters: the script needs no ``__main__`` guard.
+    :meth:`step` hands over a frame and returns the newest known pose, carried to that frame by odometry.
     Close it, or use it in a ``with`` block.
 
     Attributes:
         base_map: the map.
         config: how decisions are made.
-        engines: the processes by name, ``track`` and ``search``.
+        engines: the processes, by name: ``track`` and ``search``.
     """
 
     def __init__(self, base_map: BaseMap | str | os.PathLike[str], config: LocalizerConfig | None = None) -> None:
@@ -70,15 +70,15 @@ class AsyncLocalizer(SavedState):
 
         Args:
             base_map: the path of a ``.coview`` file, or a map that was loaded from one.
-            config: how decisions are made; None takes the defaults.
+            config: how decisions are made; None: the defaults.
 
         Raises:
-            As :class:`~coview_stream.localization.localizer.Localizer`. InputError: the map is in no file.
+            As :class:`~coview_stream.localization.localizer.Localizer`. InputError: the map is not in a file.
         """
         self.base_map, self.config = checked_arguments(base_map, config)
         if self.base_map.path is None:
             raise InputError("the map is in no file; save it, and give the path: other processes read it from there")
-        SearchIndex.of(self.base_map, self.config, load=False)  # errors show here rather than in the children
+        SearchIndex.of(self.base_map, self.config, load=False)  # errors show here, not in the children
         protection_level(np.eye(6))  # imports SciPy now
         self._mailbox = Mailbox()
         path, sha256 = str(self.base_map.path), self.base_map.sha256
@@ -93,10 +93,10 @@ class AsyncLocalizer(SavedState):
         self._end = weakref.finalize(self, _end, self._feed, self._pid)
 
     def prepare(self, timeout: float | None = None) -> None:
-        """Wait until the processes have opened the map and compiled their kernels; the first time takes a minute.
+        """Wait until the processes have opened the map and compiled their kernels, a minute on the first run.
 
         Raises:
-            CoViewError: they cannot, and say why. TimeoutError: they have not after ``timeout`` seconds.
+            CoViewError: a process failed; the text says why. TimeoutError: not ready after ``timeout`` seconds.
         """
         self._check_usable()
         end = time.monotonic() + (float("inf") if timeout is None else timeout)
@@ -107,43 +107,43 @@ class AsyncLocalizer(SavedState):
             time.sleep(_STEP)
 
     def step(self, cloud: Reals, T_odom_body: Pose, stamp: float) -> Fix:
-        """Hand over one more frame and return at once; arguments as of ``Localizer.step``.
+        """Hand over one more frame and return at once; arguments as for ``Localizer.step``.
 
-        Frames may come faster than they are worked on: then the newest replaces the one that waits (:attr:`skipped`).
+        If frames come faster than they are processed, the newest replaces the waiting one (:attr:`skipped`).
 
         Returns:
             The fix at this frame: see :meth:`fix`.
 
         Raises:
-            CloudError, RunError: as ``Localizer.step``, and nothing changes. CoViewError: a process has died or has
-                failed at an earlier frame; it is started again, and the place is searched for. Raised once for each
-                failure (of several since the last call, only the first is told); this frame is taken, go on.
+            CloudError, RunError: as ``Localizer.step``; nothing changes. CoViewError: a process died or failed at an
+                earlier frame; it is restarted, and the place is searched for. Raised once per failure (of several since
+                the last call, only the first is reported); this frame is accepted, continue.
         """
         self._check_usable()
         self._mailbox.add_frame(cloud, T_odom_body, stamp)
         try:
             return self.fix()
         finally:
-            self._feed.wake_for(self._mailbox)  # at last: a thread that works now would delay this one
+            self._feed.wake_for(self._mailbox)  # last: a thread that wakes earlier would delay this one
 
     def fix(self) -> Fix:
-        """Return the fix of the newest frame, by all results that have come; RuntimeError before the first frame.
+        """Return the fix at the newest frame from all results so far; RuntimeError before the first frame.
 
-        Its pose is the newest fix of the tracking process, carried on by odometry: covariance and protection level grow
-        by odometry's drift since then. ``fix.evidence.stamp`` is the stamp of the newest registration. If no frame of
-        the last 5 s has been worked on there is no pose (DOUBTED).
+        The pose is the newest fix of the tracking process, carried on by odometry: covariance and protection level grow
+        with odometry drift since then. ``fix.evidence.stamp`` is the stamp of the newest registration. There is no
+        pose (DOUBTED) if no frame of the last 5 s has been processed.
 
         Raises:
-            CoViewError: as of :meth:`step`.
+            CoViewError: as for :meth:`step`.
         """
         self._check_usable()
         self._mailbox.raise_error()
         return self._mailbox.fix()
 
     def wait(self, timeout: float | None = None) -> Fix:
-        """Wait until everything handed over has been worked on, a search included, and return :meth:`fix`.
+        """Wait until all frames have been processed, and any search is done; return :meth:`fix`.
 
-        After each step it gives the fixes of a ``Localizer``. TimeoutError after ``timeout`` seconds.
+        Called after each step, it gives the fixes of a ``Localizer``. TimeoutError after ``timeout`` seconds.
         """
         self._check_usable()
         if not self._mailbox.wait(timeout):
@@ -152,12 +152,12 @@ class AsyncLocalizer(SavedState):
 
     @property
     def state(self) -> State:
-        """State of the newest fix."""
+        """The state of the newest fix."""
         return self._mailbox.state
 
     @property
     def searching(self) -> bool:
-        """Whether a search of the map waits or is under way."""
+        """Whether a search of the map is waiting or running."""
         return self._mailbox.searching
 
     @property
@@ -167,11 +167,11 @@ class AsyncLocalizer(SavedState):
 
     @property
     def skipped(self) -> int:
-        """Number of frames that have been left out, as a newer one came before they were worked on."""
+        """Number of frames that a newer one replaced before they were processed."""
         return self._mailbox.counters.dropped
 
     def reset(self) -> None:
-        """Forget everything but the map; the next frame may be of another odometry."""
+        """Forget everything but the map; the next frame may use another odometry."""
         self._check_usable()
         self._mailbox.begin(keep_calibration=False)
 
@@ -181,21 +181,21 @@ class AsyncLocalizer(SavedState):
         self._mailbox.begin(keep_calibration=True)
 
     def hint_pose(self, T_map_body: Pose) -> None:
-        """Hint that the robot may be here at the next frame; as ``Localizer.hint_pose``."""
+        """Suggest that the robot may be here at the next frame; as ``Localizer.hint_pose``."""
         self._check_usable()
         validate_pose(T_map_body, self.base_map.origin)
         with self._mailbox.changed:
             self._mailbox.hints.offer(np.array(T_map_body, dtype=np.float64), None)
 
     def guess_place(self, guess: PlaceGuess) -> None:
-        """Have the search try a guess of the robot's place; as ``Localizer.guess_place``."""
+        """Let the search try a guess of the robot's place; as ``Localizer.guess_place``."""
         self._check_usable()
         require_ground(guess, self.base_map)
         with self._mailbox.changed:
             self._mailbox.hints.offer_guess(guess)
 
     def hint_calibration(self, earlier: Calibration) -> None:
-        """Begin with an earlier calibration of this robot; as ``Localizer.hint_calibration``."""
+        """Start from an earlier calibration of this robot; as ``Localizer.hint_calibration``."""
         self._check_usable()
         with self._mailbox.changed:
             self._mailbox.earlier = earlier.require_plausible()
@@ -230,30 +230,30 @@ class _Frame(NamedTuple):
 
     stamp: float
     T_odom_body: Pose
-    travelled: float  # metres driven since the beginning
-    turned: float  # radians likewise
+    travelled: float  # metres driven since the start
+    turned: float  # radians turned since the start
 
 
 class Mailbox:
     """The agent's frames on their way to the engines, and the newest fix on its way back, behind one lock.
 
-    To the feed of the engines it is a robot. Pure logic: no thread, no process, no clock but for statistics.
+    The engine feed treats it as a robot. Pure logic: no thread or process; the clock serves statistics only.
     """
 
     def __init__(self) -> None:
         self.counters, self.errors = Counters(), ErrorLog()
         self.calibration: Calibration | None = None
-        self.earlier: Calibration | None = None  # goes with the next frame
+        self.earlier: Calibration | None = None  # sent with the next frame
         self.changed = threading.Condition()
         self._epoch = 0
         self._error: str | None = None  # not raised yet
-        self._search_told = False  # whether a restart of its engine has told the failure of the search under way
+        self._search_told = False  # whether a restart of its engine has reported the failure of the running search
         self.begin(keep_calibration=False)
 
     # ---- the agent's side
 
     def begin(self, keep_calibration: bool) -> None:
-        """Begin again without a place, in another epoch."""
+        """Start a new epoch without a place."""
         with self.changed:
             self._epoch += 1
             self.hints = PlaceHints()
@@ -263,16 +263,16 @@ class Mailbox:
                 self.queue: EngineQueue = EngineQueue(_NAME, self._epoch, self.counters, self.errors)
                 self.calibration = self.earlier = None
             self._newest: _Frame | None = None
-            self._lost: KeyframeEvidence | None = None  # as the engine was started again, until it tracks
+            self._lost: KeyframeEvidence | None = None  # set when the engine was restarted, until it tracks
             self._forget_fix()
 
     def _forget_fix(self) -> None:
         self._fix: Fix | None = None
-        self._fixed: _Frame | None = None  # its frame
-        self._frames: dict[int, _Frame] = {}  # by their stamps in nanoseconds, from the one under way on
+        self._fixed: _Frame | None = None  # the frame of that fix
+        self._frames: dict[int, _Frame] = {}  # by stamp in nanoseconds, from the frame being processed on
 
     def add_frame(self, cloud: Reals, T_odom_body: Pose, stamp: float) -> None:
-        """Check a frame and have it wait for the engine."""
+        """Check a frame and queue it for the engine."""
         points = validate_cloud(cloud)
         with self.changed:
             last = self._newest
@@ -288,14 +288,14 @@ class Mailbox:
             self.queue.put_frame(PairedFrame(message, now, T, None, driven, turned), now)
 
     def raise_error(self) -> None:
-        """Raise the first failure of an engine since the last call, once."""
+        """Raise the first engine failure since the last call."""
         with self.changed:
             error, self._error = self._error, None
         if error is not None:
             raise CoViewError(error)
 
     def wait(self, timeout: float | None) -> bool:
-        """Wait until nothing is left to do, or an engine fails; False after ``timeout`` seconds."""
+        """Wait until nothing is left to do or an engine fails; False after ``timeout`` seconds."""
         with self.changed:
             return self.changed.wait_for(lambda: self.queue.idle or self._error is not None, timeout)
 
@@ -310,24 +310,24 @@ class Mailbox:
 
     @property
     def searching(self) -> bool:
-        """Whether a search waits or is under way."""
+        """Whether a search is waiting or running."""
         with self.changed:
             return self.queue.searching
 
     @property
     def _unseen(self) -> float:
-        """Seconds from the newest frame that has been worked on to the newest one."""
+        """Seconds from the newest processed frame to the newest frame."""
         return 0.0 if self._newest is None or self._fixed is None else self._newest.stamp - self._fixed.stamp
 
     def fix(self) -> Fix:
-        """Return the fix of the newest frame."""
+        """Return the fix at the newest frame."""
         with self.changed:
             newest, fix, at, state = self._newest, self._fix, self._fixed, self.state
             lost, unseen, calibration = self._lost, self._unseen, self.calibration
         if newest is None:
             raise RuntimeError("no frame yet; call step first")
         if fix is None or at is None or (state is State.LOST and lost is not None):
-            evidence = None if fix is None else fix.evidence  # newer than the loss: why the place does not come back
+            evidence = None if fix is None else fix.evidence  # newer than the loss: says why the place is not regained
             return Fix(newest.stamp, state, evidence=evidence or lost, calibration=calibration)
         if state is State.TRACKING:
             if newest is at:
@@ -344,13 +344,13 @@ class Mailbox:
     # ---- the feed's side
 
     def has_job(self, engine: str) -> bool:
-        """Whether there is a frame or the result of a search for ``track``, a keyframe for ``search``."""
+        """Whether ``track`` has a frame or a search result to process, or ``search`` a keyframe."""
         if engine == "track":
             return self.queue.has_frame or self.queue.has_result
         return self.queue.search_demand is not None
 
     def take_job(self, engine: str) -> Job | None:
-        """Hand out the newest frame, or the result of a search if no frame waits, or the newest keyframe."""
+        """Hand out the newest frame, else a search result; for ``search`` the newest keyframe."""
         with self.changed:
             if engine == "search":
                 self._search_told = False
@@ -382,12 +382,12 @@ class Mailbox:
             self.hints.verified(fix.T_map_body, self.calibration)
 
     def note_doubt(self, job: Job) -> None:
-        """Give no pose until the result of a job comes: its frame contradicts the place."""
+        """Withhold poses until the result of a job comes: its frame contradicts the place."""
         with self.changed:
             self.queue.note_doubt(job)
 
     def handle_failure(self, job: Job, reason: str, rejected: bool = False) -> None:
-        """Search again where the tracking engine has forgotten the robot; tell the agent."""
+        """Restart the search if the tracking engine has forgotten the robot; report the failure to the agent."""
         with self.changed:
             if isinstance(job, FrameJob):
                 if self.queue.frame_failed(job, reason, rejected):
@@ -399,14 +399,14 @@ class Mailbox:
             self.changed.notify_all()
 
     def engine_restarted(self, engine: str = "track", why: str = "it died") -> None:
-        """Search again if the tracking engine was started again; tell the agent."""
+        """Restart the search if the tracking engine was restarted; report it to the agent."""
         with self.changed:
             self._fail(f"{why}; it is started again", searches=engine == "track")
             self._search_told = self._search_told or engine == "search"
             self.changed.notify_all()
 
     def _fail(self, error: str, searches: bool) -> None:
-        """Note an error; if the place is forgotten, begin another epoch with the last place as a hint."""
+        """Keep an error; if the place is forgotten, start another epoch with the last place as a hint."""
         self._error = self._error or error  # the first since the last call
         if not searches:
             return

@@ -26,43 +26,43 @@ from coview_stream.stream.transport.zenoh_transport import open_client
 
 _log = logging.getLogger(__name__)
 
-MAX_UNREAD_POSES = 100  # ten seconds of them; as many statuses
+MAX_UNREAD_POSES = 100  # ten seconds of poses; the same for statuses
 
 
 class RobotClient:
-    """Streamer of one robot's frames to a node, and receiver of its poses; a context manager.
+    """Client that sends one robot's frames to a node and receives its poses; a context manager.
 
     >>> with RobotClient("rover1", "tcp/127.0.0.1:7447") as robot:     # doctest: +SKIP
-    ...     robot.wait_for_node(10)                                    # samples sent before it runs are lost
+    ...     robot.wait_for_node(10)                                    # earlier samples are lost
     ...     robot.send_odometry(T_odom_body, stamp)                    # before the cloud that it belongs to
     ...     robot.send_cloud(points, stamp)
     ...     for pose in robot.poses():
     ...         print(pose.T_map_body)
 
-    Sending and reading may happen on different threads. Of unread poses the newest 100 are kept.
+    Sending and reading may happen on different threads. The newest 100 unread poses are kept.
 
-    In an event loop ``async with`` and ``async for`` do the same; ``send_cloud`` and ``send_odometry`` never wait, and
-    calls that do go to a thread: ``await asyncio.to_thread(robot.wait_for_node, 10)``.
+    In an event loop use ``async with`` and ``async for``; ``send_cloud`` and ``send_odometry`` never wait, and
+    calls that do belong on a thread: ``await asyncio.to_thread(robot.wait_for_node, 10)``.
 
     Args:
         robot: its name, as given to ``coview-stream serve --robot``.
-        endpoint: zenoh endpoint (or several) of the router or node; if neither this nor ``listen`` nor ``config`` nor
-            ``transport`` is given, ``tcp/127.0.0.1:7447``.
+        endpoint: zenoh endpoint (or several) of the router or node; ``tcp/127.0.0.1:7447`` if neither this nor
+            ``listen``, ``config`` or ``transport`` is given.
         listen: endpoint (or several) to wait for connections on.
         config: zenoh configuration file (JSON5).
         base: first part of the keys.
         preset: key convention, see :mod:`coview_stream.stream.transport.keys`.
-        cloud_encoding: ``xyz``, ``xyzi``, ``foxglove``, ``cdr`` or ``keelson``; None takes the preset's.
-        odometry_encoding: ``json``, ``cdr``, ``foxglove`` or ``keelson``; None takes the preset's.
-        transport: one that is open already; the caller closes it.
+        cloud_encoding: ``xyz``, ``xyzi``, ``foxglove``, ``cdr`` or ``keelson``; None: the preset's.
+        odometry_encoding: ``json``, ``cdr``, ``foxglove`` or ``keelson``; None: the preset's.
+        transport: an open transport, which the caller closes.
 
     Attributes:
-        keys: of the messages sent and received.
-        latest_status: newest status received; None before the first. Its ``stamp_ns`` is the node's clock, since 1970.
+        keys: keys of the messages sent and received.
+        latest_status: newest status received; None before the first. Its ``stamp_ns`` is the node's Unix time.
         malformed: number of poses and statuses that could not be decoded.
 
     Raises:
-        ConfigError: a name, preset or encoding is not valid.
+        ConfigError: a name, preset or encoding is invalid.
         TransportError: the session cannot be opened. A missing router is no error: the client waits for it in the
             background.
     """
@@ -88,7 +88,7 @@ class RobotClient:
         self._transport = transport if transport is not None else open_client(endpoint, listen, config)
         self._poses: LatestQueue[PoseMessage] = LatestQueue(MAX_UNREAD_POSES)
         self._statuses: LatestQueue[dict[str, Any]] = LatestQueue(MAX_UNREAD_POSES)
-        self._latest_pose: tuple[float, PoseMessage] | None = None  # with its local time of arrival
+        self._latest_pose: tuple[float, PoseMessage] | None = None  # with its local arrival time
         self._closed = False
         try:
             self._sender = Sender(self._transport, self.keys, cloud_encoding, odometry_encoding)
@@ -103,8 +103,8 @@ class RobotClient:
     def latest_pose(self) -> PoseMessage | None:
         """The newest pose received, while it is valid.
 
-        None before the first, as soon as a status has another state than TRACKING, and when none has come for 2 s of
-        local time: a robot that is lost, or has lost its node, must not drive by an old pose.
+        None before the first, once a status has another state than TRACKING, and when no pose has come for 2 s of
+        local time: a robot that is lost, or has lost its node, must not drive on an old pose.
         """
         newest = self._latest_pose
         if newest is None or monotonic() - newest[0] >= STALE or not _valid(self.latest_status):
@@ -112,13 +112,13 @@ class RobotClient:
         return newest[1]
 
     def send_cloud(self, points: npt.ArrayLike, stamp: float, times: Floats | None = None) -> None:
-        """Publish one lidar frame; it is dropped if the link is busy with the one before, or without subscriber.
+        """Publish one lidar frame; dropped if the link is busy with the previous one or nothing subscribes.
 
         Args:
             points: (N, 3), or (N, 4) with an unused intensity: body frame (x forward, z up), metres.
-            stamp: sensor time, seconds; the same clock as the odometry's.
+            stamp: sensor time, seconds, on the clock of the odometry.
             times: (N,) seconds after ``stamp`` at which each point was measured; None if the frame is deskewed. Raw
-                rows cannot carry them: a client without an explicit encoding sends such a frame as foxglove.PointCloud.
+                rows have none: without an explicit encoding the client sends such a frame as foxglove.PointCloud.
 
         Raises:
             InputError: an array has the wrong shape, no point is finite, or the stamp is not in seconds.
@@ -130,20 +130,20 @@ class RobotClient:
     def send_odometry(self, T_odom_body: Pose, stamp: float) -> None:
         """Publish one odometry sample: (4, 4) odometry <- body, metres, gravity aligned; ``stamp`` in seconds.
 
-        Never waits. The last 1024 samples wait for a link that is held up; then the oldest is dropped, and logged.
+        Never waits. Up to 1024 samples queue for a congested link; then the oldest is dropped, which is logged.
 
         Raises:
-            InputError: the matrix is no rigid transform, or the stamp is not in seconds.
+            InputError: the matrix is not a rigid transform, or the stamp is not in seconds.
             TransportError: the client is closed.
         """
         self._check_open()
         self._sender.put_odometry(self._sender.odometry(T_odom_body, nanoseconds(stamp)))
 
     def poses(self, timeout: float | None = None) -> Received[PoseMessage]:
-        """Iterate over poses as they arrive, oldest unread first, by ``for`` or by ``async for``.
+        """Iterate over poses as they arrive, oldest unread first, with ``for`` or ``async for``.
 
-        Ends when the client is closed, or when no pose came for ``timeout`` seconds (None: waits for ever). Each pose
-        is given once, even to several iterators.
+        Ends when the client is closed, or when no pose comes for ``timeout`` seconds (None: never). Several iterators
+        share the poses: each pose is given once.
         """
         return Received(self._poses, timeout)
 
@@ -152,9 +152,9 @@ class RobotClient:
         return Received(self._statuses, timeout)
 
     def wait_for_node(self, seconds: float) -> bool:
-        """Wait for a subscriber to this robot's clouds; False if there is none after ``seconds``.
+        """Wait until this robot's clouds have a subscriber; False if there is none after ``seconds``.
 
-        Samples sent before are lost.
+        Samples sent earlier are lost.
 
         Raises:
             TransportError: the client is closed.
@@ -163,7 +163,7 @@ class RobotClient:
         return self._transport.await_subscriber(self._sender.cloud_key, seconds)
 
     def relocalize(self, timeout: float = 5.0) -> dict[str, Any]:
-        """Make the node forget the pose and search again; returns its reply.
+        """Make the node forget the pose and search again; return its reply.
 
         Raises:
             TransportError: no answer within ``timeout`` seconds, the node refused, or the client is closed.
@@ -181,25 +181,25 @@ class RobotClient:
         map: str | None = None,
         within: float | None = None,
     ) -> dict[str, Any]:
-        """Tell the node where the robot may be: one more place for its search to try, which is never trusted.
+        """Tell the node where the robot may be: one more place for its search to try, never trusted.
 
         Args:
             x: in the frame of the map's sources, metres.
             y: likewise.
             yaw: heading, radians, counter-clockwise from the map's x axis; None: any.
-            distance: metres around it that are tried as well, 20 at most.
+            distance: radius around it that is tried as well, metres, at most 20.
             timeout: seconds.
-            map: name of the one of several maps in whose frame x and y are.
-            within: metres around x and y, 50 or more, outside of which nothing is searched until the place is known;
-                this is trusted, a quarter wider than given, and grows with the distance driven.
+            map: where there are several maps, the name of the one whose frame x and y are in.
+            within: radius around x and y, metres, at least 50; nothing outside is searched until the place is known.
+                This is trusted, a quarter wider than given, and grows with the distance driven.
 
         Returns:
-            The reply; ``taken`` is False where the guess is refused, and ``note`` says why: the place is known, or the
+            The reply; ``taken`` is False if the guess is refused, and ``note`` says why: the place is known, or the
             map has no ground there.
 
         Raises:
             TransportError: no answer within ``timeout`` seconds, the node refused, or the client is closed.
-            InputError: a value is no number, or out of its range.
+            InputError: a value is not a number or out of range.
         """
         from coview_stream.stream.node.last_place import guess_of_fields  # few clients need it
 
@@ -210,14 +210,14 @@ class RobotClient:
         return self._transport.query(self.keys.suggest, parameters, timeout)
 
     def reset(self, timeout: float = 5.0) -> dict[str, Any]:
-        """Make the node forget all that it knows of this robot; returns its reply. Errors as :meth:`relocalize`."""
+        """Make the node forget all that it knows about this robot; return its reply. Errors as :meth:`relocalize`."""
         self._check_open()
         return self._transport.query(self.keys.reset, timeout=timeout)
 
     def close(self) -> None:
-        """Undeclare, end all iterators and close the session unless it is the caller's; idempotent.
+        """Undeclare, end all iterators and close the session unless the caller owns it; idempotent.
 
-        Takes up to three seconds where the link is held up.
+        Takes up to three seconds on a congested link.
         """
         self._poses.close()
         self._statuses.close()
@@ -240,7 +240,7 @@ class RobotClient:
         await asyncio.to_thread(self.close)
 
     def __repr__(self) -> str:
-        """Return robot, keys and the state that the node reports, in one line."""
+        """Return the robot, its key and the state that the node reports, in one line."""
         status = self.latest_status
         state = "no status yet" if status is None else f"state {str(status.get('state'))[:20]}"
         return f"RobotClient({self.robot!r}, sends on {self._sender.cloud_key}, {'closed' if self._closed else state})"
@@ -275,10 +275,10 @@ class RobotClient:
 
     def _reject(self, sample: Sample, error: MessageError) -> None:
         self.malformed += 1
-        if self.malformed == 1:  # once: a wrong sender is wrong ten times a second
+        if self.malformed == 1:  # once: a wrong sender is wrong at every message
             _log.warning("%s: %s", sample.key, error)
 
 
 def _valid(status: dict[str, Any] | None) -> bool:
-    """Whether poses are valid under a status; True without one, as access rules may withhold it."""
+    """Whether poses are valid under a status; True without one, as access rules may withhold statuses."""
     return status is None or status.get("state", "TRACKING") == "TRACKING"

@@ -1,4 +1,4 @@
-"""Table of the robots on the network: newest poses, statuses and rates. Without a clock: callers pass the time."""
+"""Table of the robots on the network: newest poses, statuses and rates. It has no clock: callers pass the time."""
 
 from __future__ import annotations
 
@@ -14,12 +14,12 @@ from coview_stream.geometry.transforms import yaw_of
 from coview_stream.messages.types import PoseMessage
 
 WINDOW = 5.0  # seconds over which the rate of poses is measured
-STALE = 2.0  # seconds without a pose after which the last one is no longer shown
-SILENT = 5.0  # seconds without any message: a node sends one every second
-MAX_ROBOTS = 1000  # of more, those that were heard least recently are forgotten: strangers may choose names
-_LEAST = 1e-6  # smaller probabilities of a wrong place are not told apart: columns are narrow
+STALE = 2.0  # seconds without a pose after which the last pose is no longer shown
+SILENT = 5.0  # seconds without any message: a node sends one each second
+MAX_ROBOTS = 1000  # beyond it the robots heard least recently are forgotten: strangers may choose names
+_LEAST = 1e-6  # smaller probabilities of a wrong place are shown as this one: columns are narrow
 
-_INDENT = " " * 4  # of a reason below its robot
+_INDENT = " " * 4  # of a reason below its robot's line
 
 _COLUMNS = (
     ("robot", -12),
@@ -39,15 +39,15 @@ _COLUMNS = (
 
 @dataclass
 class RobotView:
-    """Newest messages of one robot. Times are of a monotonic clock, seconds."""
+    """Newest messages of one robot. Times are seconds of a monotonic clock."""
 
     robot: str
     heard: float  # time of the newest message
     pose: PoseMessage | None = None
     status: dict[str, Any] = field(default_factory=dict)
     status_heard: float = -math.inf
-    node: str = ""  # who serves it, in words, if another node did before
-    arrivals: deque[float] = field(default_factory=lambda: deque(maxlen=1024))  # times of the last poses
+    node: str = ""  # the node that serves it, in words, if it was another node before
+    arrivals: deque[float] = field(default_factory=lambda: deque(maxlen=1024))  # times of the newest poses
 
     def pose_rate(self, now: float) -> float:
         """Return poses per second over the last :data:`WINDOW` seconds."""
@@ -65,19 +65,19 @@ class RobotView:
 
 
 class FleetTable:
-    """Table of all robots that sent a message so far."""
+    """Table of all robots that have sent a message."""
 
     def __init__(self) -> None:
-        self.views: dict[str, RobotView] = {}  # the one that was heard last is the last
+        self.views: dict[str, RobotView] = {}  # in order of their newest messages, newest last
 
     def add_pose(self, message: PoseMessage, now: float) -> None:
-        """Take in a pose that arrived at ``now``."""
+        """Add a pose that arrived at ``now``."""
         view = self._view(message.robot, now)
         view.pose = message
         view.arrivals.append(now)
 
     def add_status(self, robot: str, status: dict[str, Any], now: float) -> None:
-        """Take in a status that arrived at ``now``; no field of it is required."""
+        """Add a status that arrived at ``now``; no field of it is required."""
         view = self._view(robot, now)
         before, after = _mapping(view.status, "node").get("id"), _mapping(status, "node")
         if before is not None and after.get("id") != before:
@@ -85,12 +85,12 @@ class FleetTable:
         view.status, view.status_heard = status, now
 
     def table(self, now: float, header: bool = True, width: int | None = None) -> list[str]:
-        """Return lines of text, sorted by robot's name: one for each, or its reason below where it is long.
+        """Return lines of text, sorted by robot name: one for each robot, with a long reason below it.
 
         Args:
-            now: time of the clock that messages were added by, seconds.
+            now: seconds on the clock used for the messages.
             header: begin with the titles of the columns.
-            width: of the terminal, characters, which no line exceeds; None: a line for each robot, however long.
+            width: width of the terminal, characters, which no line exceeds; None: one line per robot, however long.
         """
         lines = [_line([title for title, _ in _COLUMNS])[:width]] if header else []
         for name in sorted(self.views):
@@ -148,8 +148,8 @@ def _line(row: list[str]) -> str:
 
 
 def _odds(wrong: float) -> str:
-    """Say a probability in few letters."""
-    if not 0.0 <= wrong <= 1.0:  # its message does not say
+    """Return a probability in a few characters."""
+    if not 0.0 <= wrong <= 1.0:  # the message has no probability
         return "-"
     if wrong < _LEAST:
         return f"<1 in {1.0 / _LEAST:,.0f}"
@@ -165,5 +165,5 @@ def _number(value: object, digits: int) -> str:
     try:
         known = isinstance(value, (int, float)) and math.isfinite(value)
         return f"{value:.{digits}f}" if known else "-"
-    except OverflowError:  # integers of JSON have no limit
+    except OverflowError:  # JSON integers have no limit
         return "-"

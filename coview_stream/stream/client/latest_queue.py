@@ -1,4 +1,4 @@
-"""What comes from the network and waits to be read: a bounded queue, for threads and for event loops."""
+"""A bounded queue of messages from the network that wait for a reader, for threads and event loops."""
 
 from __future__ import annotations
 
@@ -15,9 +15,9 @@ _Item = TypeVar("_Item")
 
 
 class LatestQueue(Generic[_Item]):
-    """Bounded queue in order of arrival; a new item replaces the oldest when it is full.
+    """Bounded queue in order of arrival; when it is full a new item replaces the oldest.
 
-    ``put`` never blocks, so that a slow reader does not block a subscription. ConfigError for a ``size`` below 1.
+    ``put`` never blocks, so a slow reader cannot block a subscription. ConfigError for a ``size`` below 1.
     """
 
     def __init__(self, size: int) -> None:
@@ -25,10 +25,10 @@ class LatestQueue(Generic[_Item]):
             raise ConfigError(f"queue size: {size} is out of range; use at least 1")
         self._items: deque[_Item] = deque(maxlen=size)
         self._arrived = threading.Condition()
-        self._waking: set[Callable[[], None]] = set()  # of readers in event loops
+        self._waking: set[Callable[[], None]] = set()  # from readers in event loops
         self._closed = False
         self.dropped = 0
-        """Number of items that were replaced unread."""
+        """Number of items replaced unread."""
 
     def put(self, item: _Item) -> None:
         """Add an item; after :meth:`close` it is ignored."""
@@ -41,7 +41,7 @@ class LatestQueue(Generic[_Item]):
             self._wake_loops()
 
     def get(self, timeout: float | None = None) -> _Item | None:
-        """Take the oldest item; None if there is none for ``timeout`` seconds (None: for ever) or it is closed."""
+        """Take the oldest item; None if none comes for ``timeout`` seconds (None: no limit) or the queue is closed."""
         deadline = None if timeout is None else time.monotonic() + timeout
         with self._arrived:
             while not self._items and not self._closed:
@@ -52,9 +52,9 @@ class LatestQueue(Generic[_Item]):
             return self._items.popleft() if self._items else None
 
     async def next(self, timeout: float | None = None) -> _Item | None:
-        """Take the oldest item as :meth:`get` does, from an event loop, which goes on meanwhile.
+        """Take the oldest item as :meth:`get` does, without blocking the event loop.
 
-        Cancelled, it takes nothing: the item that comes is the next reader's.
+        If cancelled it takes nothing: the next reader gets the item.
         """
         import asyncio
 
@@ -80,7 +80,7 @@ class LatestQueue(Generic[_Item]):
                 self._waking.discard(wake)
 
     def close(self) -> None:
-        """Wake every reader; the items inside can still be taken."""
+        """Wake every reader; items in the queue can still be taken."""
         with self._arrived:
             self._closed = True
             self._arrived.notify_all()
@@ -92,9 +92,9 @@ class LatestQueue(Generic[_Item]):
 
 
 class Received(Generic[_Item]):
-    """Items of a queue as they arrive, for ``for`` and for ``async for``.
+    """Iterator over a queue's items as they arrive, for ``for`` and ``async for``.
 
-    Ends when the queue is closed, or when no item came for ``timeout`` seconds (None: never).
+    Ends when the queue is closed, or when no item comes for ``timeout`` seconds (None: never).
     """
 
     def __init__(self, unread: LatestQueue[_Item], timeout: float | None) -> None:

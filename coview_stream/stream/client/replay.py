@@ -1,4 +1,4 @@
-"""Replay of a recorded run as a live robot: frames on absolute deadlines, odometry just before its frame."""
+"""Replay of a recorded run as a live robot: frames on absolute deadlines, odometry just before each frame."""
 
 from __future__ import annotations
 
@@ -33,11 +33,11 @@ class ReplayConfig:
 
     Attributes:
         rate: frames sent per second; None keeps the spacing of the run's stamps.
-        speed: factor on that spacing; 2 sends a run in half its time. Not together with ``rate``.
-        odometry_rate: odometry samples sent per second, interpolated between frames; None sends one per frame.
-        clouds_only: send no odometry: the node makes its own.
-        loop: repeat without end; stamps go on increasing, and the robot is back where it started.
-        read_ahead: frames read and encoded before their time.
+        speed: factor on that spacing; 2 sends a run in half its time. Excludes ``rate``.
+        odometry_rate: odometry samples sent per second, interpolated between frames; None: one per frame.
+        clouds_only: send no odometry; the node makes its own.
+        loop: repeat for ever; stamps keep increasing, and the robot is back at its start.
+        read_ahead: number of frames read and encoded ahead of time.
     """
 
     rate: float | None = None
@@ -63,7 +63,7 @@ class ReplayConfig:
 
 @dataclass(frozen=True)
 class ScheduledSample:
-    """An odometry sample of a replay, with a frame or without."""
+    """An odometry sample of a replay, with or without a frame."""
 
     due: float  # seconds after the start of the replay
     stamp: float  # seconds of sensor time
@@ -72,9 +72,9 @@ class ScheduledSample:
 
 
 def schedule(run: Run, config: ReplayConfig) -> Iterator[ScheduledSample]:
-    """Yield every sample in order; without end if ``config.loop`` is set."""
+    """Yield every sample in order, for ever if ``config.loop`` is set."""
     dues = frame_times(run, config)
-    # a lap lasts one period longer than its frames: from the last one to the first of the next lap
+    # a lap is one period longer than its frames: from its last frame to the first of the next lap
     lap_due = float(dues[-1]) + _period(dues, 1.0 / config.rate if config.rate else _SINGLE_FRAME_PERIOD)
     lap_stamp = float(run.stamps[-1] - run.stamps[0]) + _period(run.stamps, _SINGLE_FRAME_PERIOD)
     lap = 0
@@ -103,7 +103,7 @@ def frame_times(run: Run, config: ReplayConfig) -> Floats:
 
 
 def odometry_spacing(run: Run, config: ReplayConfig) -> float:
-    """Return the usual seconds between odometry samples, of sensor time or of real time, the longer of both."""
+    """Return the usual time between odometry samples, seconds: sensor time or real time, whichever is longer."""
     dues = frame_times(run, config)
     real = _period(dues, 0.0)
     parts = max(1, round(real * (config.odometry_rate or 0.0)))
@@ -111,7 +111,7 @@ def odometry_spacing(run: Run, config: ReplayConfig) -> float:
 
 
 def enough_odometry(run: Run, config: ReplayConfig) -> float:
-    """Return odometry samples per second that are 0.05 s apart, of sensor time or of real time, the longer of both."""
+    """Return the odometry rate, Hz, that spaces samples by 0.05 s of sensor or real time, whichever is longer."""
     parts = max(1, round(_USUAL_RATE * odometry_spacing(run, replace(config, odometry_rate=None))))
     return parts / max(_period(frame_times(run, config), 1.0), 1e-3)
 
@@ -120,18 +120,18 @@ def _period(times: Floats, single: float) -> float:
     return float(np.median(np.diff(times))) if len(times) > 1 else single
 
 
-_SILENT = 3.0  # seconds: a node tells of its health once a second
+_SILENT = 3.0  # seconds: a node reports its health once a second
 
 
 def await_engines(
     transport: Transport, base: str, robot: str, seconds: float, wait: Callable[[float], object] = time.sleep
 ) -> bool:
-    """Wait up to ``seconds`` until a node that serves a robot tells that its engines are ready; False if none has.
+    """Wait up to ``seconds`` until a node that serves the robot reports ready engines; False if none does.
 
-    Where no node tells of its health for three seconds, another program has subscribed, and nothing more is waited
-    for. ``wait`` as of :meth:`Transport.await_subscriber`; where it ends the wait, this is True.
+    If no node reports its health for three seconds, another program has subscribed, and the wait ends. ``wait`` as in
+    :meth:`Transport.await_subscriber`; if it ends the wait, the result is True.
     """
-    told = dict[str, bool]()  # by key, of the nodes that serve the robot
+    told = dict[str, bool]()  # by key, for the nodes that serve the robot
 
     def hear(sample: Sample) -> None:
         document = read_object(sample.payload)
@@ -151,8 +151,8 @@ def await_engines(
     return True
 
 
-_MAX_MEASUREMENTS = 100_000  # of each kind: a replay in a loop may run for days
-_LATE = 0.02  # seconds; a live lidar's own jitter stays below
+_MAX_MEASUREMENTS = 100_000  # of each kind: a looped replay may run for days
+_LATE = 0.02  # seconds; more than a live lidar's own jitter
 
 
 class Clock(Protocol):
@@ -163,7 +163,7 @@ class Clock(Protocol):
         ...
 
     def wait(self, seconds: float) -> bool:
-        """Wait for ``seconds`` (not at all if not positive); True as soon as the replay is to end."""
+        """Wait for ``seconds`` (not at all if not positive); True once the replay is to end."""
         ...
 
 
@@ -173,18 +173,18 @@ class ReplayReport:
 
     frames: int = 0  # clouds sent
     odometry: int = 0  # odometry samples sent
-    points: int = 0  # in all clouds sent
-    damaged: int = 0  # frames not sent: they cannot be read, or have no finite point
-    first_error: CloudError | None = None  # of the damaged frames
+    points: int = 0  # in all clouds sent together
+    damaged: int = 0  # frames not sent: unreadable, or without a finite point
+    first_error: CloudError | None = None  # among the damaged frames
     seconds: float = 0.0  # from the first message to the last
-    # milliseconds of publishing each cloud, and of each sample's delay after its deadline
+    # milliseconds to publish each cloud, and delay of each sample after its deadline
     put_ms: deque[float] = field(default_factory=lambda: deque(maxlen=_MAX_MEASUREMENTS))
     late_ms: deque[float] = field(default_factory=lambda: deque(maxlen=_MAX_MEASUREMENTS))
-    finished: bool = False  # or ended before its last frame
-    heard: bool = True  # False if there was no subscriber; set by the caller, who has looked
+    finished: bool = False  # False if it ended before its last frame
+    heard: bool = True  # False if there was no subscriber; set by the caller, who checks
 
     def text(self) -> str:
-        """Summarize in a few lines."""
+        """Summarize the replay in a few lines."""
         rate = f" ({(self.frames - 1) / self.seconds:.2f} Hz)" if self.frames > 1 and self.seconds else ""
         sent = f"{counted(self.frames, 'frame')}{rate} and {counted(self.odometry, 'odometry sample')} sent"
         lines = [
@@ -205,7 +205,7 @@ class ReplayReport:
 
 @dataclass(frozen=True)
 class _EncodedSample:
-    """A scheduled sample with its messages encoded; ``error`` in place of a damaged cloud."""
+    """A scheduled sample with its encoded messages; ``error`` replaces a damaged cloud."""
 
     due: float
     odometry: Encoded | None
@@ -217,14 +217,13 @@ class _EncodedSample:
 def replay(
     run: Run, sender: Sender, config: ReplayConfig, clock: Clock, on_frame: Callable[[int], None] = lambda frames: None
 ) -> ReplayReport:
-    """Send the whole run, or until the clock says to end.
+    """Send the run, until its end or until the clock ends the replay.
 
-    A frame behind its deadline is sent at once; deadlines do not move. ``on_frame`` gets the number of frames sent so
-    far.
+    A frame behind its deadline is sent at once; deadlines do not move. ``on_frame`` gets the number of frames sent.
 
     Raises:
         CloudError: no frame can be read.
-        InputError: a stamp of the run is not in seconds, or a pose no rigid transform.
+        InputError: a stamp of the run is not in seconds, or a pose is not a rigid transform.
     """
     report = ReplayReport()
     with _ReadAhead(_encoded(run, sender, config), config.read_ahead) as samples:
@@ -271,7 +270,7 @@ def _encoded(run: Run, sender: Sender, config: ReplayConfig) -> Iterator[_Encode
 
 
 class _ReadAhead:
-    """Iterator run on a thread of its own, ``size`` items ahead, so that a slow disk does not delay the replay."""
+    """Iterator that runs on its own thread, ``size`` items ahead, so that a slow disk does not delay the replay."""
 
     def __init__(self, source: Iterator[_EncodedSample], size: int) -> None:
         self._source = source
@@ -299,7 +298,7 @@ class _ReadAhead:
                 if not self._offer(sample):
                     return
             self._offer(None)
-        except Exception as error:  # of any kind: it is raised on the thread that reads
+        except Exception as error:  # of any kind: raised again on the reading thread
             self._offer(error)
 
     def _offer(self, item: _EncodedSample | BaseException | None) -> bool:

@@ -1,4 +1,4 @@
-"""Publisher of one robot's clouds and odometry, in the formats and on the keys of a preset."""
+"""Publisher of one robot's clouds and odometry, in the encodings and on the keys of a preset."""
 
 from __future__ import annotations
 
@@ -19,18 +19,18 @@ from coview_stream.stream.transport.keys import RobotKeys, check_expression
 from coview_stream.stream.transport.rmw import RmwPublisher, publisher_token, type_hash
 from coview_stream.stream.transport.transport import Publisher, Transport, Urgency
 
-_TIMED = {"xyz": "foxglove", "xyzi": "foxglove"}  # raw rows have no place for times
+_TIMED = {"xyz": "foxglove", "xyzi": "foxglove"}  # raw rows cannot hold times
 _SETTLE = 0.3  # seconds; see Sender.settle
 _MAX_STAMP = 2**63 / 1e9  # seconds; int64 nanoseconds end there
 
 
 class Sender:
-    """Encoder and publishers of one robot's clouds and odometry; encoding and publishing may be on different threads.
+    """Encoder and publishers of one robot's clouds and odometry; encoding and publishing may use different threads.
 
-    The caller closes ``transport``. Encodings are names of codecs; None takes the preset's, else ``xyz`` and ``json``.
+    The caller closes ``transport``. Encodings are names of codecs; None: the preset's, else ``xyz`` and ``json``.
 
     Raises:
-        ConfigError: an encoding is unknown, or a key cannot be published on.
+        ConfigError: an encoding is unknown, or a key cannot be published to.
     """
 
     def __init__(
@@ -57,11 +57,11 @@ class Sender:
         self._odometry = _publisher(transport, self.odometry_key, "data", keys.rmw)
 
     def cloud(self, points: npt.ArrayLike, stamp_ns: int, times: Floats | None = None) -> Encoded:
-        """Encode (N, 3) body-frame points, metres; a fourth column is not sent. ``times`` as in CloudMessage.
+        """Encode (N, 3) body-frame points, metres; a fourth column is ignored. ``times`` as in CloudMessage.
 
         Raises:
-            CloudError: the array has another shape or no numbers, or there is no finite point.
-            InputError: ``times`` has no numbers, or another length.
+            CloudError: the array has another shape or is not numeric, or no point is finite.
+            InputError: ``times`` is not numeric or has another length.
         """
         rows = cloud_rows(points)
         if times is not None and np.shape(times) != (len(rows),):
@@ -76,25 +76,25 @@ class Sender:
         return self._with_convention(encode_cloud(CloudMessage(stamp_ns, xyz, seconds), encoding))
 
     def odometry(self, T_odom_body: Pose, stamp_ns: int) -> Encoded:
-        """Encode a (4, 4) pose, odometry <- body, metres; InputError if it is no rigid transform."""
+        """Encode a (4, 4) pose, odometry <- body, metres; InputError if it is not a rigid transform."""
         T = to_array(T_odom_body, np.float64, "T_odom_body", InputError)
         if not is_pose(T):
             raise InputError(f"T_odom_body (odometry <- body) {why_no_pose(T)}")
         return self._with_convention(encode_odometry(OdometryMessage(stamp_ns, T), self.odometry_encoding))
 
     def put_cloud(self, message: Encoded) -> None:
-        """Publish a cloud; one that does not fit the link is dropped."""
+        """Publish a cloud; it is dropped if the link is congested."""
         self._cloud.put(message)
         self._last_cloud = time.monotonic()
 
     def put_odometry(self, message: Encoded) -> None:
-        """Publish an odometry sample. Never waits: the last 1024 wait for the link, then the oldest is dropped."""
+        """Publish an odometry sample. Never waits: up to 1024 queue for the link, then the oldest is dropped."""
         self._odometry.put(message)
 
     def settle(self) -> None:
-        """Wait for the last frame to leave: zenoh sends large ones in the background and drops them at closing.
+        """Wait for the last frame to leave: zenoh sends large ones in the background and drops them when it closes.
 
-        Measured: of 1 MB frames put just before closing the session none arrived, and there is no call to flush.
+        In a measurement no 1 MB frame put just before the session closed arrived, and zenoh has no call to flush.
         """
         time.sleep(max(0.0, self._last_cloud + _SETTLE - time.monotonic()))
 
@@ -104,24 +104,24 @@ class Sender:
         self._odometry.close()
 
     def _with_convention(self, message: Encoded) -> Encoded:
-        # a convention without Encoding is followed to the byte: readers tested against us must work with it
+        # a convention without Encoding is followed byte for byte: readers tested against this sender must work with it
         return replace(message, encoding="") if self._bare else message
 
 
 def nanoseconds(stamp: float) -> int:
-    """Turn seconds into whole nanoseconds; InputError for no number, or one beyond int64 (nanoseconds, as a rule)."""
+    """Convert seconds to nanoseconds; InputError if not a number or beyond int64 (usually nanoseconds already)."""
     try:
-        plausible = bool(abs(stamp) < _MAX_STAMP)  # False of NaN
-    except (TypeError, ValueError):  # no number at all
+        plausible = bool(abs(stamp) < _MAX_STAMP)  # False for NaN
+    except (TypeError, ValueError):  # not a number
         plausible = False
     if not plausible:
         raise InputError(f"stamp {stamp!r}: give seconds of sensor time, not nanoseconds")
-    whole = math.floor(stamp)  # apart: the product of today's seconds with 1e9 is off by 128 ns
+    whole = math.floor(stamp)  # separately: a product of today's seconds and 1e9 is off by 128 ns
     return whole * 1_000_000_000 + round((float(stamp) - whole) * 1e9)
 
 
 def _publishing_key(expression: str, rmw: bool, type_name: str, option: str) -> str:
-    """Complete a key to publish on from an expression to subscribe to: a final wildcard gets a name."""
+    """Turn a key expression for subscribing into a key to publish to: a final wildcard gets a name."""
     head, _, last = expression.rpartition("/")
     if head and last in ("*", "**"):
         expression = f"{head}/{type_hash(type_name) if rmw else 'robot'}"
@@ -132,5 +132,5 @@ def _publisher(transport: Transport, key: str, urgency: Urgency, rmw: bool) -> P
     inner = transport.publisher(key, urgency)
     if not rmw:
         return inner
-    # no reader looks our clouds up by token, but all require the attachment, whose identity derives from one
+    # readers do not look up our clouds by token, but they all require the attachment, whose identity derives from one
     return RmwPublisher(inner, publisher_token(key, "0", "coview_robot", 0), time.time_ns)

@@ -1,1 +1,1 @@
-"""Maps over the network: a server of sites on zenoh, fetching of sites, and a follower of their changes."""
+"""Maps over the network: a zenoh server of sites, fetching of sites, and a follower of their changes."""

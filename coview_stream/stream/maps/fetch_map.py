@@ -1,4 +1,4 @@
-"""Fetching of a map: from its address to a path that :meth:`BaseMap.load` takes; and its preparation for a node."""
+"""Fetch a map from its address to a path that :meth:`BaseMap.load` accepts, and prepare it for a node."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ from coview_stream.stream.maps.zenoh_source import ZenohSource
 log = logging.getLogger("coview_stream.maps")
 
 MAP_SERVER_ENDPOINT = "tcp/127.0.0.1:7448"
-"""Default endpoint of ``serve-map``, and of ``zenoh://SITE``."""
+"""Default endpoint of ``serve-map`` and ``zenoh://SITE``."""
 
 _NICE = 10
 _LOOK = 0.1  # seconds
@@ -32,11 +32,11 @@ _LOOK = 0.1  # seconds
 def source_of(
     address: str, base: str = "coview", connect: Sequence[str] = (), config: Path | None = None
 ) -> SiteSource:
-    """Return the source of a site's address; ``base``, ``connect`` and ``config`` are for ``zenoh://SITE``.
+    """Return the source for a site's address; ``base``, ``connect`` and ``config`` apply to ``zenoh://SITE``.
 
     Raises:
-        ConfigError: no address of a site. DependencyError: a library is missing. TransportError: an object store cannot
-            be used.
+        ConfigError: not the address of a site. DependencyError: a library is missing. TransportError: an object store
+            cannot be used.
     """
     parts = urlsplit(address)
     if parts.scheme in ("http", "https"):
@@ -62,17 +62,16 @@ def fetch_map(
 ) -> Path:
     """Fetch a site, or update its cached copy, and return the path to load.
 
-    Every layer is compared with its hash before it is used. If the source cannot be reached, the cached copy is used,
-    with a warning.
+    Every layer's hash is checked before use. If the source cannot be reached, the cached copy is used with a warning.
 
     Args:
         address: ``zenoh://SITE``, ``zenoh://HOST:PORT/SITE``, ``https://...`` or ``s3://...``.
-        around: x, y, radius in metres, in the map's coordinates: only the tiles in this circle; None for all.
+        around: x, y, radius in metres, in map coordinates: fetch only the tiles in this circle; None: all.
         verify_key: public key, or its PEM file, that must have signed the site.
-        connect: zenoh endpoints of an address without one (``tcp/127.0.0.1:7448``).
+        connect: zenoh endpoints for an address without one (``tcp/127.0.0.1:7448``).
 
     Raises:
-        ConfigError: a malformed address or circle. TransportError: no source, and nothing in the cache.
+        ConfigError: the address or circle is malformed. TransportError: no source, and nothing in the cache.
         MapError: the site is damaged or not signed with the key, or no tile is in the circle.
         InputError: the key cannot be read. DependencyError: a library is missing.
     """
@@ -92,9 +91,9 @@ def open_mirror(
     connect: Sequence[str] = (),
     config: Path | None = None,
 ) -> Mirror:
-    """Open the mirror of a site, up to date if the source can be reached; the caller closes its source.
+    """Open the mirror of a site, updated if the source can be reached; the caller closes its source.
 
-    Arguments and errors as of :func:`fetch_map`; ``base`` and ``config`` are for ``zenoh://SITE``.
+    Arguments and errors as in :func:`fetch_map`; ``base`` and ``config`` apply to ``zenoh://SITE``.
     """
     endpoints = list(connect) or ([] if config is not None else [MAP_SERVER_ENDPOINT])
     mirror = Mirror(source_of(address, base, endpoints, config), verify_key, around)
@@ -108,9 +107,9 @@ def open_mirror(
 
 
 def prepare_map(place: Path, cancelled: Callable[[], bool]) -> None:
-    """Write the working file of a site, of a part of one, or of several maps, in a low-priority process.
+    """Write the working file of a site, a part of a site or several maps, in a low-priority process.
 
-    The node itself would miss poses meanwhile. Errors are not raised: opening the map afterwards raises the same.
+    The node would miss poses if it did this itself. Errors are not raised: opening the map afterwards raises them.
     ``cancelled`` is polled; True ends the process.
     """
     if not (place.is_dir() or place.suffix in (PART_SUFFIX, JOINED_SUFFIX)):
@@ -131,7 +130,7 @@ def prepare_map(place: Path, cancelled: Callable[[], bool]) -> None:
 
 
 def main() -> None:
-    """Open the map that the command line names."""
+    """Open the map named on the command line."""
     from coview_stream.basemap.joined import load_map
 
     with contextlib.suppress(OSError, AttributeError):

@@ -1,4 +1,4 @@
-"""Follower of sites elsewhere: fetches their changes and has a node take them over."""
+"""Follower of remote sites: fetches their changes and makes a node load them."""
 
 from __future__ import annotations
 
@@ -16,16 +16,16 @@ from coview_stream.stream.transport.error_guard import RateLimitedErrors, is_pan
 log = logging.getLogger("coview_stream.maps")
 
 PERIOD = 10.0
-"""Seconds between two questions to the source, and from a change that failed to the next try."""
+"""Seconds between requests to the source, and from a failed change to the next try."""
 
-_LOOK = 1.0  # seconds between two looks at the outcome of a change
-_MOST_DOUBLINGS = 5  # of the time to the next try, or question
-_HOUR = 3600.0  # seconds in which changes are counted: each doubles the time between two questions
+_LOOK = 1.0  # seconds between checks of a change's outcome
+_MOST_DOUBLINGS = 5  # of the time to the next try or request
+_HOUR = 3600.0  # seconds over which changes are counted: each doubles the time between requests
 _SETTLED = ("changed", "unchanged")
 
 
 class MapFollower:
-    """Asks the sources of mirrored sites for changes, on a thread of its own.
+    """Asks the sources of mirrored sites for changes, on its own thread.
 
     Attributes:
         last: ``address``, ``result`` (``current``, ``fetched``, ``unreachable`` or ``refused``) and ``error``.
@@ -40,16 +40,15 @@ class MapFollower:
     ) -> None:
         """Follow the opened mirrors of all sites of the node's map, asking their sources every ``period`` seconds.
 
-        Each change within an hour doubles the time between two questions, up to 32 times. ``take_over`` asks the node
-        to load the map again. ``outcome`` returns the result of that: ``changed``, ``unchanged``, ``loading`` (mirrors
-        stay as they are meanwhile), or another word for a failure. A change that failed is asked for again, each time
-        later.
+        Each change within an hour doubles the time between requests, up to 32 times. ``take_over`` asks the node to
+        load the map again. ``outcome`` returns the result: ``changed``, ``unchanged``, ``loading`` (mirrors stay as
+        they are meanwhile), or another word for a failure. A failed change is tried again, with growing delays.
         """
         self._mirrors, self._take_over, self._outcome = mirrors, take_over, outcome
         self._period = period
         self._guard = RateLimitedErrors(log)
         self._asked, self._again_at, self._tries, self._pending = time.monotonic(), 0.0, 0, False
-        self._changes: deque[float] = deque(maxlen=_MOST_DOUBLINGS)  # times of the newest ones
+        self._changes: deque[float] = deque(maxlen=_MOST_DOUBLINGS)  # times of the newest changes
         self.name = ", ".join(mirror.source.name for mirror in mirrors)
         self.last: dict[str, Any] = {}
         self._note("unreachable" if self._offline else "current", self._offline or None)
@@ -59,7 +58,7 @@ class MapFollower:
         return "; ".join(mirror.offline for mirror in self._mirrors if mirror.offline)
 
     def run(self, stopping: threading.Event) -> None:
-        """Follow until ``stopping`` is set; an error is logged once, and the present map is kept."""
+        """Follow until ``stopping`` is set; an error is logged once, and the present map stays."""
         try:
             while not stopping.wait(min(_LOOK, self._period)):
                 with self._guard.catch(self.name):
@@ -76,7 +75,7 @@ class MapFollower:
         if outcome in _SETTLED:
             self._pending, self._tries = False, 0
         changed = False
-        recent = sum(now - at < _HOUR for at in self._changes)  # a source may go to and fro: engines start each time
+        recent = sum(now - at < _HOUR for at in self._changes)  # a source may alternate, and each change starts engines
         if now - self._asked >= self._period * 2**recent:
             self._asked = now
             changed = self._refresh()
@@ -98,7 +97,7 @@ class MapFollower:
                 if mirror.refresh():
                     changed = True
                     _ = mirror.map_path  # chooses the tiles of a part again
-            except BaseException as error:  # of any kind: the thread goes on
+            except BaseException as error:  # of any kind: the thread must continue
                 if not (isinstance(error, Exception) or is_panic(error)):
                     raise
                 mirror.offline, failure = str(error) or type(error).__name__, error

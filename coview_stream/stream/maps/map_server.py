@@ -1,4 +1,4 @@
-"""Map server: answers queries for the manifest and the layers of a site's directory on zenoh."""
+"""Map server: answers zenoh queries for the manifest and layers in a site's directory."""
 
 from __future__ import annotations
 
@@ -19,15 +19,15 @@ from coview_stream.stream.transport.error_guard import RateLimitedErrors
 
 log = logging.getLogger("coview_stream.maps")
 
-_LOOK = 1.0  # seconds between two looks at the manifest's file
-_QUEUE, _OF_ONE = 256, 32  # waiting queries, and those of one reader; more are refused, and clients repeat them
-_ANSWERS = 8  # at once, one for each reader: one that has stopped holds up a thread until zenoh drops it
+_LOOK = 1.0  # seconds between checks of the manifest file
+_QUEUE, _OF_ONE = 256, 32  # waiting queries, in all and of one reader; more are refused, and clients repeat them
+_ANSWERS = 8  # at once, one per reader: a stopped reader blocks a thread until zenoh drops it
 
 
 class MapServer:
-    """Serves one site: its manifest, and the layers in the present and the last manifest; no other file.
+    """Serves one site: its manifest, and the layers in the present and the previous manifest; no other file.
 
-    Some threads answer the queries; another looks for changes of the manifest.
+    Some threads answer queries; another watches the manifest for changes.
     """
 
     def __init__(
@@ -38,26 +38,26 @@ class MapServer:
         listen: Sequence[str] = (),
         config: Path | None = None,
     ) -> None:
-        """Open a session and start to answer.
+        """Open a session and start answering.
 
         Raises:
-            MapError: the directory is no site. TransportError: the network cannot be used.
+            MapError: the directory is not a site. TransportError: the network cannot be used.
         """
         import zenoh
 
         self._raw = read_manifest(directory)
         self.manifest = Manifest.from_bytes(self._raw, str(directory))
         self.answered = 0
-        """Number of queries answered with bytes."""
+        """Number of queries answered with data."""
         self.sent = 0
-        """Bytes of these answers."""
+        """Bytes in these answers."""
         self._directory, self._keys = directory, keys
         self._store = TileStore(directory)
         self._layers = _sizes(self.manifest)
         self._guard = RateLimitedErrors(log)
         self._stopping = threading.Event()
-        self._queries: deque[tuple[str, Any]] = deque()  # with their readers
-        self._answering: set[str] = set()  # readers
+        self._queries: deque[tuple[str, Any]] = deque()  # with the reader that sent each
+        self._answering: set[str] = set()  # readers with an answer under way
         self._waiting = threading.Condition()
         self._counting = threading.Lock()
         with zenoh_config.zenoh_errors("zenoh session"):
@@ -74,10 +74,10 @@ class MapServer:
             thread.start()
 
     def close(self) -> None:
-        """Stop."""
+        """Stop the server."""
         self._stopping.set()
         with self._guard.catch("closing"):
-            self._session.close()  # and all that was declared on it
+            self._session.close()  # and everything declared on it
         with self._waiting:
             self._queries.clear()
             self._waiting.notify_all()
@@ -87,7 +87,7 @@ class MapServer:
 
     def _put(self, query: Any) -> None:
         source = query.source_info
-        reader = "" if source is None else str(source.source_id.zid)  # all who do not say count as one
+        reader = "" if source is None else str(source.source_id.zid)  # readers without an id count as one
         with self._waiting:
             own = sum(waiting == reader for waiting, _ in self._queries)
             if taken := own < _OF_ONE and len(self._queries) < _QUEUE:
@@ -98,7 +98,7 @@ class MapServer:
                 query.reply_err(b"too many queries wait: ask again")
 
     def _next(self) -> tuple[str, Any] | None:
-        """Wait for a query of a reader who has no answer under way; None at the end."""
+        """Wait for a query from a reader without an answer under way; None at the end."""
         with self._waiting:
             while not self._stopping.is_set():
                 for at, (reader, query) in enumerate(self._queries):
@@ -115,7 +115,7 @@ class MapServer:
             with self._guard.catch("answering"), query:
                 if query.key_expr.intersects(self._keys.manifest):
                     self._reply(query, self._keys.manifest, self._raw)
-                key = str(query.key_expr)  # no wildcards for layers: one query would ask for the whole site
+                key = str(query.key_expr)  # no wildcards for layers: one query could ask for the whole site
                 sha256 = key.removeprefix(self._keys.layer(""))
                 if sha256 != key and sha256 in self._layers:
                     try:
@@ -152,7 +152,7 @@ class MapServer:
                 refused = ""
                 if manifest == self.manifest:
                     continue
-                self._layers = _sizes(self.manifest) | _sizes(manifest)  # clients may still fetch by the last one
+                self._layers = _sizes(self.manifest) | _sizes(manifest)  # clients may still fetch with the previous one
                 self.manifest, self._raw = manifest, raw
                 log.info("manifest %s is served now", manifest.sha256[:12])
                 self._publisher.put(manifest.sha256)

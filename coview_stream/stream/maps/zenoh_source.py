@@ -1,4 +1,4 @@
-"""Site of a map server on zenoh, as a source."""
+"""Source for a site on a zenoh map server."""
 
 from __future__ import annotations
 
@@ -14,16 +14,16 @@ from coview_stream.stream.transport import zenoh_config
 from coview_stream.stream.transport.keys import check_chunk, check_prefix
 
 _NO_ANSWER, _UNREACHABLE = "Timeout", "Unable to connect"  # zenoh's words
-_MAX_MESSAGE = MAX_LAYER + (1 << 20)  # bytes of an answer and its frame; no manifest is larger either
-_MAX_SITES = 100  # that are asked for their names
+_MAX_MESSAGE = MAX_LAYER + (1 << 20)  # bytes of an answer with its framing; no manifest is larger either
+_MAX_SITES = 100  # sites that are asked for their names
 _TIMEOUT = 30.0  # seconds for an answer: 256 MB at 10 MB/s
 
 
 @dataclass(frozen=True)
 class MapKeys:
-    """The keys of one site."""
+    """The zenoh keys of one site."""
 
-    prefix: str  # of all of them
+    prefix: str  # of all its keys
 
     @classmethod
     def of(cls, site: str, base: str = "coview") -> MapKeys:
@@ -32,32 +32,32 @@ class MapKeys:
 
     @property
     def manifest(self) -> str:
-        """Answered with the manifest's bytes."""
+        """Key that is answered with the manifest's bytes."""
         return f"{self.prefix}/manifest"
 
     def layer(self, sha256: str) -> str:
-        """Answered with a layer's bytes."""
+        """Key that is answered with a layer's bytes."""
         return f"{self.prefix}/layers/{sha256}"
 
     @property
     def changed(self) -> str:
-        """Published whenever the manifest changes: its sha256, as text."""
+        """Key on which the manifest's sha256 is published, as text, when the manifest changes."""
         return f"{self.prefix}/changed"
 
     @property
     def all(self) -> str:
-        """Expression of all of them."""
+        """Key expression that matches all of them."""
         return f"{self.prefix}/**"
 
 
 class ZenohSource:
-    """A site on a map server; the zenoh session is opened with the first query."""
+    """A site on a map server; the first query opens the zenoh session."""
 
     def __init__(
         self, site: str, base: str = "coview", connect: Sequence[str] = (), config: Path | None = None
     ) -> None:
-        """Use a site's name and zenoh endpoints; ConfigError if the name cannot be part of a key."""
-        # the mirror is named after it: all that chooses the site is in it
+        """Take a site's name and zenoh endpoints; ConfigError if the name cannot be part of a key."""
+        # the mirror's name holds everything that selects the site
         parts = [*connect, *([] if config is None else [str(config)]), *([] if base == "coview" else [f"base {base}"])]
         where = ",".join(parts)
         self.name = f"zenoh://{site}" + (f" ({where})" if where else "")
@@ -70,7 +70,7 @@ class ZenohSource:
         return self._get(self._keys.manifest, MAX_MANIFEST)
 
     def layer(self, sha256: str, size: int) -> bytes:
-        """Return a layer's bytes. TransportError: no server answers, or the server cannot read it."""
+        """Return a layer's bytes. TransportError: no server answers, or it cannot read the layer."""
         return self._get(self._keys.layer(sha256), size)
 
     def close(self) -> None:
@@ -106,13 +106,13 @@ class ZenohSource:
         raise TransportError(f"{self.name}: {refusal or self._silence()}")
 
     def _silence(self) -> str:
-        """Return the reason for a missing answer: other sites are served there, or none."""
+        """Return why no answer came: the server has other sites, or no server answers."""
         import zenoh
 
         begin, end = self._keys.prefix.rpartition("/")[0] + "/", "/manifest"
         with zenoh_config.zenoh_errors(self.name):
             replies = self._session.get(f"{begin}*{end}", timeout=_TIMEOUT, target=zenoh.QueryTarget.ALL)
-            # one after the other: each holds a manifest
+            # one at a time: each holds a manifest
             keys = [str(reply.ok.key_expr) for reply in islice(replies, _MAX_SITES) if reply.ok is not None]
         others = sorted({key.removeprefix(begin).removesuffix(end) for key in keys})
         if others and self._keys.manifest not in keys:

@@ -1,4 +1,4 @@
-"""The feed of the engines: a thread for each, which hands it the robots' jobs and starts it again when it dies."""
+"""The feed of the engines: one thread per engine hands it the robots' jobs and restarts it when it dies."""
 
 from __future__ import annotations
 
@@ -14,20 +14,20 @@ from coview_stream.stream.node.engine_queue import EngineQueue, Job, Result, Rou
 from coview_stream.stream.transport.error_guard import RateLimitedErrors
 
 # seconds
-_MAX_RESTART_PAUSE = 10.0  # before an engine that keeps dying is started again
-_LIFE = 60.0  # of an engine, after which its death is not one in a row
-_STOPPED_INTERVAL = 1.0  # between two checks for a stopped engine; the second one kills it
+_MAX_RESTART_PAUSE = 10.0  # before an engine that keeps dying is restarted
+_LIFE = 60.0  # life of an engine after which its death is not one in a row
+_STOPPED_INTERVAL = 1.0  # between checks for a stopped engine; the second check kills it
 _ERROR_PAUSE = 0.2  # after an unexpected error
-_IDLE_WAIT = 0.05  # of an engine without work; a job wakes it earlier
+_IDLE_WAIT = 0.05  # for an engine without work; a job wakes it earlier
 
 
 class Robot(Protocol):
-    """A robot with jobs for the engines. The result or failure of each job comes before the next of its kind."""
+    """A robot with jobs for the engines. It gets the result or failure of each job before the next job of its kind."""
 
     queue: EngineQueue
 
     def has_job(self, engine: str) -> bool:
-        """Whether there is a job for an engine; without a lock: perhaps no more."""
+        """Whether there is a job for an engine; read without a lock, so it may be gone."""
         ...
 
     def take_job(self, engine: str) -> Job | None:
@@ -39,7 +39,7 @@ class Robot(Protocol):
         ...
 
     def note_doubt(self, job: Job) -> None:
-        """Give no pose until the result of a job comes: its frame contradicts the place."""
+        """Withhold poses until the result of a job comes: its frame contradicts the place."""
         ...
 
     def handle_failure(self, job: Job, reason: str, rejected: bool = False) -> None:
@@ -55,9 +55,9 @@ R = TypeVar("R", bound=Robot)
 
 
 class EngineFeed(Generic[R]):
-    """Feeds the engines of one map, each by a thread of its own, and recovers from an engine's failure.
+    """Feeds the engines of one map, each on its own thread, and recovers from engine failures.
 
-    ``on_change`` is called with a robot whose state may have changed, with None for any.
+    ``on_change`` is called with a robot whose state may have changed; None: any robot.
     """
 
     def __init__(
@@ -69,7 +69,7 @@ class EngineFeed(Generic[R]):
     ) -> None:
         self.robots = list(robots)
         self.engines = dict(engines)
-        self.restarts = dict.fromkeys(self.engines, 0)  # of each engine
+        self.restarts = dict.fromkeys(self.engines, 0)  # per engine
         self.threads: list[threading.Thread] = []
         self._errors = errors
         self._on_change = on_change
@@ -85,10 +85,10 @@ class EngineFeed(Generic[R]):
         for name, target in (targets | {"stopped": self._end_stopped_engines}).items():
             thread = threading.Thread(target=target, name=f"coview-{name}", daemon=True)
             thread.start()
-            self.threads.append(thread)  # now, for one that has not started counts as one that has ended
+            self.threads.append(thread)  # after its start: until then it would count as ended
 
     def stop(self) -> None:
-        """Have the threads end; without waiting."""
+        """Tell the threads to end, without waiting."""
         self._stopping.set()
         for wake in self._wake.values():
             wake.set()
@@ -104,7 +104,7 @@ class EngineFeed(Generic[R]):
             thread.join(timeout=max(0.0, last - time.monotonic()))
 
     def wake_for(self, robot: R) -> None:
-        """Wake the engines that have a job of a robot: not all at every message, of which there may be thousands."""
+        """Wake the engines that have a job for a robot: not all, as there may be thousands of messages."""
         for engine, wake in self._wake.items():
             if robot.has_job(engine):
                 wake.set()
@@ -112,7 +112,7 @@ class EngineFeed(Generic[R]):
     def _feed(self, engine: str) -> None:
         while not self._stopping.is_set():
             with self._errors.catch(f"feeding the {engine} engine") as caught:
-                self._wake[engine].clear()  # before looking: a job that comes from now on sets it again
+                self._wake[engine].clear()  # before checking: a job that comes later sets it again
                 if (turn := self.next_job(engine)) is not None:
                     self.work(engine, *turn)
                 elif not self._wake[engine].wait(timeout=_IDLE_WAIT):
@@ -121,7 +121,7 @@ class EngineFeed(Generic[R]):
                 self._stopping.wait(_ERROR_PAUSE)
 
     def next_job(self, engine: str) -> tuple[R, Job] | None:
-        """Return whose turn it is at an engine, and the job; None if there is nothing to do."""
+        """Return the robot whose turn it is at an engine, and its job; None if there is nothing to do."""
         turns = self._turns[engine]
         order = turns.order()
         if engine == "search":
@@ -134,7 +134,7 @@ class EngineFeed(Generic[R]):
         return None
 
     def work(self, engine: str, robot: R, job: Job) -> None:
-        """Do one job; an error is counted and concerns this robot, unless the engine died."""
+        """Do one job; an error is counted and affects this robot only, unless the engine died."""
         runner = self.engines[engine]
         runner.on_doubt = partial(robot.note_doubt, job)
         try:
@@ -146,7 +146,7 @@ class EngineFeed(Generic[R]):
             robot.handle_failure(job, str(error))
         except DiedError as error:
             self._engine_died(engine, error, robot, job)
-        except Exception as error:  # not foreseen, but the other robots' work goes on
+        except Exception as error:  # unforeseen, but the other robots' work goes on
             self._errors.report(f"{job.robot}: unexpected, at the {engine} engine", error)
             robot.handle_failure(job, repr(error))
             self._stopping.wait(_ERROR_PAUSE)
@@ -154,12 +154,12 @@ class EngineFeed(Generic[R]):
             self._deaths[engine] = 0
             robot.handle_result(job, result, time.monotonic())
             self._on_change(robot)
-            self.wake_for(robot)  # a frame may have asked for a search
+            self.wake_for(robot)  # a frame may have requested a search
         finally:
-            runner.on_doubt = lambda: None  # else it keeps the job's cloud
+            runner.on_doubt = lambda: None  # otherwise it keeps the job's cloud alive
 
     def watch(self, engine: str) -> None:
-        """Check an engine without a job: a dead one is reported, and started again before it is needed."""
+        """Check an idle engine: a dead one is reported, and restarted before it is needed."""
         try:
             self.engines[engine].watch()
         except DiedError as error:
@@ -172,7 +172,7 @@ class EngineFeed(Generic[R]):
                     engine.end_stopped()
 
     def _engine_died(self, engine: str, error: DiedError, robot: R | None = None, job: Job | None = None) -> None:
-        """Report a dead engine and back off before restarting it."""
+        """Report a dead engine, and wait before its restart."""
         if self._stopping.is_set():
             return
         why = last_line(str(error))

@@ -1,6 +1,6 @@
-"""Engine in a process of its own, which is started again when it dies, and killed when it hangs.
+"""An engine in its own process, which is restarted when it dies and killed when it hangs.
 
-Native code (registration, BLAS, tree building) may hold the interpreter lock for long; only a process of its own keeps
+Native code (registration, BLAS, tree building) may hold the interpreter lock for long, so only a separate process keeps
 the node's pose clock steady. Its command is ``python -m coview_stream.stream.node.engine_process FD KIND PARENT``.
 """
 
@@ -37,17 +37,16 @@ if TYPE_CHECKING:
 log = logging.getLogger("coview_stream.node")
 
 NICE = {"odometry": 2, "track": 4, "search": 10}
-"""Niceness of the engines, below the pose clock and the receiving threads in the parent. Every pose waits for
-odometry."""
+"""Niceness of the engines, below the parent's pose clock and receiving threads. Every pose waits for odometry."""
 
-_POLL_INTERVAL = 0.1  # seconds between two checks whether the opening has been cancelled
-_PARENT_INTERVAL = 2.0  # seconds between two checks of an idle child whether its parent lives
-_DOUBT = ("doubt", None)  # message during a job
-_REST = 3  # such checks: a robot that is searched for sends a keyframe every few seconds
+_POLL_INTERVAL = 0.1  # seconds between checks whether the opening was cancelled
+_PARENT_INTERVAL = 2.0  # seconds between an idle child's checks that its parent lives
+_DOUBT = ("doubt", None)  # message sent during a job
+_REST = 3  # such checks: a robot with a search sends a keyframe every few seconds
 
 
 class RejectedError(Exception):
-    """The engine could not use a job's frame, which changes nothing; its hints may have been applied."""
+    """The engine could not use a job's frame; nothing changes, though its hints may have been applied."""
 
 
 class FailedError(Exception):
@@ -55,21 +54,21 @@ class FailedError(Exception):
 
 
 class DiedError(Exception):
-    """The engine's process died or hung; it has forgotten all robots."""
+    """The engine's process died or hung; the engine has forgotten all robots."""
 
 
 class CancelledError(Exception):
-    """The engine is no longer waited for."""
+    """The wait for the engine was cancelled."""
 
 
 # ---- the parent's side
 
 
 class EngineChild:
-    """The child process, which may be started before map and robots are known.
+    """The child process; it may start before map and robots are known.
 
-    It imports its libraries and loads its kernels, which takes most of its start, and then waits for the arguments of
-    :func:`~coview_stream.stream.node.engines.open_engine`: meanwhile the parent reads options, checks the map and opens
+    It imports its libraries and loads its kernels, which takes most of its start, then waits for the arguments of
+    :func:`~coview_stream.stream.node.engines.open_engine`. Meanwhile the parent reads options, checks the map and opens
     the network. It is a new interpreter: a fork deadlocks once zenoh is open, a spawn imports the host's main module.
     """
 
@@ -83,7 +82,7 @@ class EngineChild:
                 pass_fds=[theirs.fileno()],
                 stdin=subprocess.DEVNULL,
                 env=engine_environment(kind),
-                start_new_session=True,  # an interrupt at the terminal is for the parent to pass on
+                start_new_session=True,  # the parent passes on an interrupt at the terminal
             )
         self.pipe = Connection(ours.detach())
 
@@ -97,15 +96,15 @@ class EngineChild:
 
 
 def start_children(lidar_odometry: bool) -> dict[str, EngineChild]:
-    """Start the engines of a node; that of odometry, whose library may be missing, comes first."""
+    """Start the engines of a node, odometry first, as its library may be missing."""
     return {kind: EngineChild(kind) for kind in NICE if lidar_odometry or kind != "odometry"}
 
 
 def engine_environment(kind: str) -> dict[str, str]:
-    """Return our environment, with this package in reach and few threads, to leave cores to the other engines.
+    """Return our environment with this package on the path and few threads, to leave cores to the other engines.
 
-    BLAS has one. The kernels and networks of searches have all cores but one, unless ``COVIEW_THREADS`` is set: they
-    are always busy while a robot is off the map, and work with deadlines needs a free core.
+    BLAS has one thread. Search kernels and networks use all cores but one, unless ``COVIEW_THREADS`` is set: they are
+    always busy while a robot is off the map, and work with deadlines needs a free core.
     """
     cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
     threads = {"COVIEW_THREADS": str(max(1, cores - 1))} if kind == "search" else {}
@@ -121,13 +120,13 @@ class EngineProcess:
 
     Args:
         kind: ``track``, ``search`` or ``odometry``.
-        map_path: the map's file, which every process maps for itself.
-        sha256: of the map; a file that was replaced meanwhile is refused, or poses would be of another map than stated.
-        config: of the localizers and searches; None for the defaults.
-        trust: demands that the map is signed; None takes any.
-        child: the first child, started before; None starts one.
+        map_path: map file, which every process maps for itself.
+        sha256: hash of the map; a file replaced meanwhile is refused, as its poses would be relative to another map.
+        config: for the localizers and searches; None: the defaults.
+        trust: requires a signed map; None accepts any.
+        child: the first child, already started; None starts one.
         job_timeout: seconds after which a job counts as hung.
-        open_timeout: seconds after which a start does, from its newest step: a kernel compiled, the map opened.
+        open_timeout: the same for a start, from its newest step: a kernel compiled, the map opened.
     """
 
     def __init__(
@@ -152,14 +151,14 @@ class EngineProcess:
         self._lock = threading.Lock()
         self._child: EngineChild | None = None
         self._awaited: list[str] = []  # messages that a fresh child has yet to send
-        self._step: str | None = None  # newest step of its start
-        self._stopped: int | None = None  # process that was stopped at the previous check
+        self._step: str | None = None  # newest step of the child's start
+        self._stopped: int | None = None  # id of the process that the previous check found stopped
         self._deadline = float("inf")  # local time at which the present job counts as hung
         self._hung = False
 
     @property
     def pid(self) -> int | None:
-        """Process id of the child, None while there is none."""
+        """Process id of the child, None without one."""
         child = self._child
         return child.process.pid if child else None
 
@@ -176,19 +175,19 @@ class EngineProcess:
             child, self._prestarted = self._prestarted or EngineChild(self.kind), None
             self._child = child
             self._awaited = ["ready", "prepared"]
-            with contextlib.suppress(OSError):  # it has died, as the wait for its answer will find
+            with contextlib.suppress(OSError):  # it died: the wait for its answer will report it
                 child.pipe.send(self._opening)
 
     def wait_ready(self, cancelled: Callable[[], bool] = lambda: False) -> None:
-        """Wait until the child has opened the map; ``cancelled`` is asked ten times a second.
+        """Wait until the child has opened the map; ``cancelled`` is polled ten times a second.
 
         Raises:
-            CoViewError: it could not, and says why. DiedError: it died or hung. CancelledError: as asked.
+            CoViewError: the child failed; the text says why. DiedError: it died or hung. CancelledError: cancelled.
         """
         self._await("ready", cancelled)
 
     def wait_prepared(self, cancelled: Callable[[], bool] = lambda: False) -> None:
-        """Wait until a job would not wait any more; arguments and errors as of :meth:`wait_ready`."""
+        """Wait until a job would start at once; arguments and errors as in :meth:`wait_ready`."""
         for message in list(self._awaited):
             self._await(message, cancelled)
 
@@ -203,7 +202,7 @@ class EngineProcess:
             self._take(*news)
 
     def _take(self, kind: str, value: str | None) -> None:
-        """Take in a message of a fresh child: an error, a step of its start or an end of the wait."""
+        """Handle a message from a new child: an error, a step of its start or the end of a wait."""
         if kind == "error":
             raise CoViewError(value)
         if kind == "step":
@@ -214,7 +213,7 @@ class EngineProcess:
             self._awaited.remove(kind)
 
     def run(self, job: Job) -> Result:
-        """Do one job and wait for it; RejectedError, FailedError or DiedError. A dead child is started again first."""
+        """Do one job and wait for it; RejectedError, FailedError or DiedError. A dead child is restarted first."""
         if self._child is None:
             self.start()
         try:
@@ -231,14 +230,14 @@ class EngineProcess:
 
     @contextmanager
     def _exchange(self, seconds: float) -> Iterator[Connection]:
-        """Yield the pipe; sending, waiting and receiving may all hang, and together have ``seconds``."""
+        """Yield the pipe; sending, waiting and receiving may each hang, and share ``seconds``."""
         child = self._child
         self._deadline, self._hung = time.monotonic() + seconds, False
         try:
             if child is None:
                 raise EOFError
             yield child.pipe
-        except (EOFError, OSError, TypeError) as error:  # the last one: closed by another thread meanwhile
+        except (EOFError, OSError, TypeError) as error:  # TypeError: another thread has closed it
             self._end()
             end = f"had no answer for {seconds:g} s and was ended" if self._hung else "died"
             raise DiedError(f"the {self.kind} engine {end}") from error
@@ -246,10 +245,10 @@ class EngineProcess:
             self._deadline = float("inf")
 
     def watch(self) -> None:
-        """Check the child while there is no job, without waiting: it may have become ready, or died.
+        """Check the child without waiting while there is no job: it may have become ready, or died.
 
         A dead child, or one that could not open the map, is reaped and reported once (DiedError); the next call starts
-        another one, in time for the next job. By the thread that runs the jobs.
+        another in time for the next job. Called on the thread that runs the jobs.
         """
         child = self._child
         if child is None:
@@ -260,7 +259,7 @@ class EngineProcess:
                 with self._exchange(self.open_timeout) as pipe:
                     news = pipe.recv()
                 self._take(*news)
-        except (CoViewError, OSError) as error:  # the latter: closed by another thread meanwhile
+        except (CoViewError, OSError) as error:  # OSError: another thread has closed it
             self._end()
             raise DiedError(str(error) if isinstance(error, CoViewError) else f"the {self.kind} engine died") from error
         if (code := child.process.poll()) is not None:
@@ -269,14 +268,14 @@ class EngineProcess:
             raise DiedError(f"the {self.kind} engine died ({cause})")
 
     def end_stopped(self) -> None:
-        """Kill a child whose job takes too long, or that has been stopped for two calls in a row (SIGSTOP; Linux only).
+        """Kill a child whose job takes too long, or that two calls in a row find stopped (SIGSTOP; Linux only).
 
-        A stopped one would hold up the jobs until the time limit of one, and robots with them.
+        A stopped child would block the jobs, and the robots, until a job's time limit.
         """
         self.end_hung_job()
         child, stopped = self._child, None
         if child is not None and child.process.returncode is None:
-            with contextlib.suppress(OSError):  # there is no /proc; a process that a debugger holds is not "T"
+            with contextlib.suppress(OSError):  # no /proc; a process held by a debugger is not "T"
                 stat = Path(f"/proc/{child.process.pid}/stat").read_text(errors="replace")
                 if stat.rpartition(")")[2].split()[:1] == ["T"]:
                     stopped = child.process.pid
@@ -307,7 +306,7 @@ class EngineProcess:
 
 
 def unwrap(kind: str, value: Any) -> Result:
-    """Return the result or raise the error of :func:`attempt`."""
+    """Return the result of :func:`attempt`, or raise its error."""
     if kind == "done":
         result: Result = value
         return result
@@ -318,7 +317,7 @@ def unwrap(kind: str, value: Any) -> Result:
 
 
 def attempt(engine: Engine, job: Job) -> tuple[str, Any]:
-    """Do a job; return ``done`` and the result, or ``rejected`` or ``failed`` and why."""
+    """Do a job; return ``done`` and the result, or ``rejected`` or ``failed`` and the reason."""
     try:
         return "done", engine.run(job)
     except CoViewError as error:
@@ -332,16 +331,16 @@ def attempt(engine: Engine, job: Job) -> tuple[str, Any]:
 def work(
     pipe: Connection, kind: str, open_engine: Callable[..., Engine] | None = None, parent: int | None = None
 ) -> int:
-    """Run an engine in this process: load its kernels, open it, do the jobs that come through the pipe.
+    """Run an engine in this process: load its kernels, open it, do the jobs that arrive on the pipe.
 
-    On the first start on a machine the kernels are compiled before, for some seconds. Those of later jobs are loaded
-    one by one while no job waits; a job that comes meanwhile waits for one of them, a quarter of a second at most.
+    On the first start on a machine the kernels are compiled first, for some seconds. Kernels of later jobs are loaded
+    one by one while no job waits; a job that arrives meanwhile waits for one of them, at most a quarter of a second.
 
     Args:
-        pipe: to the parent. First comes what :func:`~coview_stream.stream.node.engines.open_engine` needs, then jobs.
-        kind: of the engine.
-        open_engine: opens the engine, in place of that function.
-        parent: process id of the parent. The process ends when it has another parent, even if the pipe is open.
+        pipe: to the parent: first the arguments of :func:`~coview_stream.stream.node.engines.open_engine`, then jobs.
+        kind: kind of the engine.
+        open_engine: replaces that function.
+        parent: process id of the parent. The process ends if it gets another parent, even with an open pipe.
 
     Returns:
         The exit code: 0 when the parent has gone, 1 if the engine cannot be opened, which the parent has been told.
@@ -354,17 +353,17 @@ def work(
     kernels, later_kernels = engines.KINDS[kind].kernels, engines.KINDS[kind].later_kernels
     compile_once(*kernels, *later_kernels, say=lambda text: pipe.send(("step", text)))
     for name in kernels:
-        if pipe.poll():  # the node waits for its engines, or soon a robot for its search: no more standing back
+        if pipe.poll():  # the node waits for its engines, or a robot soon for a search: full priority
             _set_group_nice(0)
         warm_up(name)
     steps: deque[Callable[[], None]] = deque(partial(warm_up, name) for name in later_kernels)
 
     def use_pause() -> None:
         while steps and not pipe.poll():
-            with contextlib.suppress(CoViewError):  # the job that needs it will say so
+            with contextlib.suppress(CoViewError):  # the job that needs it will report it
                 steps.popleft()()
 
-    with contextlib.suppress(EOFError, OSError, KeyboardInterrupt):  # the parent is gone, and so are we
+    with contextlib.suppress(EOFError, OSError, KeyboardInterrupt):  # the parent is gone: end too
         use_pause()
         opening = pipe.recv()
         _set_group_nice(0)
@@ -377,7 +376,7 @@ def work(
             pipe.send(("error", str(error)))
             return 1
         if not gc.isenabled():
-            gc.freeze()  # nearly all objects of the start stay: to look through them again would cost every job
+            gc.freeze()  # most startup objects stay: scanning them again would slow every job
             gc.enable()
         pipe.send(("prepared", None))
         _set_group_nice(NICE[kind])
@@ -386,7 +385,7 @@ def work(
             use_pause()
             pauses = 0
             while not pipe.poll(_PARENT_INTERVAL):
-                if parent not in (None, os.getppid()):  # its pipe may live on in a process that the parent has forked
+                if parent not in (None, os.getppid()):  # the parent's fork may hold the pipe open
                     return 0
                 pauses += 1
                 if pauses == _REST:
@@ -399,15 +398,15 @@ def work(
 def _set_group_nice(nice: int) -> None:
     """Set the niceness of this process's session, where Linux groups tasks by session.
 
-    There the process's own niceness only counts among the processes of one session, which this one has for itself.
+    There a process's own niceness counts only within its session, and this process is alone in its session.
     """
     with contextlib.suppress(OSError):
         Path("/proc/self/autogroup").write_text(str(nice))
 
 
 if __name__ == "__main__":
-    bound_heaps(1)  # one for each thread takes 20 MB more
-    gc.disable()  # nearly all objects of the start stay: a tenth of the time
+    bound_heaps(1)  # one per thread takes 20 MB more
+    gc.disable()  # most startup objects stay: saves a tenth of the start
     with contextlib.suppress(OSError):
         os.nice(NICE[sys.argv[2]])
     sys.exit(work(Connection(int(sys.argv[1])), sys.argv[2], parent=int(sys.argv[3])))

@@ -1,4 +1,4 @@
-"""One robot's frames, search requests and hints for the engines, their jobs, and the order of robots at an engine."""
+"""One robot's frames, search requests and hints for the engines, and the order in which an engine serves robots."""
 
 from __future__ import annotations
 
@@ -19,9 +19,9 @@ from coview_stream.stream.node.counters import Counters, ErrorLog, Latency, last
 from coview_stream.stream.node.inputs import OdometryJob, OdometryResult, PairedFrame
 
 # of searches
-_PATIENCE = 1.5  # seconds after which a waiting keyframe comes before all that have waited less
-_NEW = 8  # searches in which a robot counts as newly lost; most are found within them
-_MAX_SUPPORT = 16  # searches in a row that propose a place: with more, the map has another one like it
+_PATIENCE = 1.5  # seconds of waiting after which a keyframe goes before those that have waited less
+_NEW = 8  # searches for which a robot counts as newly lost; most are found within them
+_MAX_SUPPORT = 16  # searches in a row that propose a place: beyond it the map probably has a similar place
 
 
 @dataclass(frozen=True)
@@ -29,20 +29,20 @@ class FrameJob:
     """One lidar frame for the tracking engine."""
 
     robot: str  # name
-    epoch: int  # number of the robot's odometry frame; a new one makes the engine forget the robot's place
+    epoch: int  # id of the odometry frame; a new one makes the engine forget the place
     stamp_ns: int  # sensor time, nanoseconds
-    points: Points | None  # (N, 3) float32 body frame, metres; None: the frame before, and another search's result
+    points: Points | None  # (N, 3) float32 body frame, metres; None: previous frame, with another search result
     T_odom_body: Pose  # (4, 4) odometry at the stamp
-    times: Floats | None = None  # (N,) seconds after the stamp at which each point was measured; None for no deskewing
-    segment: Segment | None = None  # odometry while the frame was measured; goes with ``times``
-    require_verification: bool = False  # give no pose before this frame has verified the place
-    search_result: SearchResult | None = None  # of an earlier search, to be applied first
-    defer: bool = False  # frames wait for the engine: put off all work that can wait
-    # (4, 4) ``T_map_body`` where the robot may be at this frame, to be verified like any hypothesis
+    times: Floats | None = None  # (N,) seconds after the stamp at which each point was measured; None: no deskewing
+    segment: Segment | None = None  # odometry while the frame was measured; accompanies ``times``
+    require_verification: bool = False  # withhold poses until this frame has verified the place
+    search_result: SearchResult | None = None  # from an earlier search, applied first
+    defer: bool = False  # frames wait for the engine: postpone all work that can wait
+    # (4, 4) ``T_map_body`` where the robot may be at this frame, verified like any hypothesis
     hint: Pose | None = None
-    guess: PlaceGuess | None = None  # of the place; tried, never trusted
-    calibration: Calibration | None = None  # of its sensor and odometry at ``hint``, a prior
-    # the first one since a client reset the robot; another one makes the engine forget the calibration as well
+    guess: PlaceGuess | None = None  # guess of the place; tried, never trusted
+    calibration: Calibration | None = None  # of sensor and odometry at ``hint``, a prior
+    # the first epoch since a client reset the robot; another one makes the engine forget the calibration too
     first_epoch: int = 0
 
 
@@ -51,9 +51,9 @@ class FrameResult:
     """The tracking engine's answer to a frame."""
 
     fix: Fix  # after the frame
-    request: SearchRequest | None  # keyframe to search for; None for none
+    request: SearchRequest | None  # keyframe to search for; None: none
     seconds: float  # of the engine's work
-    events: tuple[Event, ...]  # changes of the engine's state since its last answer for this robot and epoch, in order
+    events: tuple[Event, ...]  # state changes since the last answer for this robot and epoch, in order
 
 
 @dataclass(frozen=True)
@@ -65,7 +65,7 @@ class SearchJob:
 
     @property
     def epoch(self) -> int:
-        """Epoch of the frame's job."""
+        """Epoch of the frame job."""
         return self.request.epoch[0]
 
 
@@ -74,19 +74,19 @@ Result: TypeAlias = FrameResult | SearchResult | OdometryResult
 
 
 class SearchDemand(NamedTuple):
-    """A robot's waiting keyframe, for the order of searches."""
+    """A robot's waiting keyframe, to order the searches."""
 
-    since: float  # local time in seconds from which a keyframe has been waiting, this one or one that it replaced
+    since: float  # local time, seconds, since when this keyframe, or one it replaced, has waited
     searches: int = 0  # number of searches since the robot was lost
-    support: int = 0  # how many of the newest of them, in a row, proposed a place
+    support: int = 0  # number of newest searches, in a row, that proposed a place
 
 
 def search_order(demands: Sequence[SearchDemand | None], now: float) -> list[int]:
-    """Return the robots of ``demands`` that want a search, in the order of their turns at local time ``now``.
+    """Return the robots of ``demands`` that want a search, in order of their turns at local time ``now``.
 
     A keyframe that has waited for 1.5 s comes first, the oldest before the others: no robot waits much longer, unless
-    the engine cannot keep up, and then all wait equally long. Otherwise a robot whose place has been proposed, which
-    needs the fewest further searches, comes before the newly lost, and these before the long lost.
+    the engine cannot keep up, and then all wait equally long. Otherwise robots with a proposed place, which need the
+    fewest further searches, come first, then the newly lost, then the long lost.
     """
 
     def rank(demand: SearchDemand) -> tuple[bool, int, bool, float]:
@@ -99,7 +99,7 @@ def search_order(demands: Sequence[SearchDemand | None], now: float) -> list[int
 
 
 class RoundRobin:
-    """Order in which robots, numbered from 0, are served by one engine: the longest wait first."""
+    """Order in which one engine serves robots, numbered from 0: the longest wait first."""
 
     def __init__(self, count: int) -> None:
         self._order = list(range(count))
@@ -109,20 +109,20 @@ class RoundRobin:
         return list(self._order)
 
     def serve(self, k: int) -> None:
-        """Count the turn that robot ``k`` has now."""
+        """Move robot ``k``, which is served now, to the end."""
         self._order.remove(k)
         self._order.append(k)
 
 
 class PlaceHints:
-    """Hints for the engine: the last place and a guess, each once in every odometry epoch.
+    """Hints for the engine: the last place and a guess, each sent once in every odometry epoch.
 
     Attributes:
-        forgotten: number of times that a client has asked to forget the place.
-        T_map_body: (4, 4) of the last place, whether the engine has it or not; None for none.
-        calibration: of the sensor and odometry there; goes with the pose, as a prior.
-        guess: the newest one, until the place is known.
-        pending_guess: the same, until a frame has taken it to the engine.
+        forgotten: number of times a client has asked to forget the place.
+        T_map_body: (4, 4) of the last place, whether the engine has it or not; None without one.
+        calibration: of sensor and odometry at that place; sent with the pose, as a prior.
+        guess: the newest guess, until the place is known.
+        pending_guess: the same, until a frame has carried it to the engine.
     """
 
     def __init__(self) -> None:
@@ -132,46 +132,46 @@ class PlaceHints:
         self.drop()
 
     def drop(self) -> None:
-        """Never offer this pose again; only a new one."""
+        """Drop this pose for good; only a new pose is offered."""
         self.T_map_body: Pose | None = None
         self.calibration: Calibration | None = None
         self._pending = False
 
     @property
     def pending(self) -> Pose | None:
-        """``T_map_body`` (4, 4) that goes with the next frame; None if the engine has it already."""
+        """``T_map_body`` (4, 4) to send with the next frame; None if the engine has it."""
         return self.T_map_body if self._pending else None
 
     def offer(self, T_map_body: Pose, calibration: Calibration | None) -> None:
-        """Take over a pose from before this session, which the engine does not know."""
+        """Take a pose from before this session, which the engine does not know."""
         self.T_map_body, self.calibration, self._pending = T_map_body, calibration, True
 
     def offer_guess(self, guess: PlaceGuess | None) -> None:
-        """Take over a guess in place of the one before."""
+        """Replace the guess."""
         self.guess = self.pending_guess = guess
 
     def verified(self, T_map_body: Pose, calibration: Calibration | None) -> None:
-        """Take over a pose that the engine itself has verified."""
+        """Take a pose that the engine itself has verified."""
         self.T_map_body, self.calibration, self._pending = T_map_body, calibration, False
         self.guess = None
 
     def begin_epoch(self) -> None:
-        """Offer all again: the engine forgets everything with an odometry frame, but the robot stands where it stood.
+        """Offer all again: with its odometry frame the engine forgets everything, but the robot has not moved.
 
-        A guess loses its circle, for it is not known how far the robot has come.
+        A guess loses its circle, as the distance driven is unknown.
         """
         self._pending = self.T_map_body is not None
         self.offer_guess(None if self.guess is None else replace(self.guess, within=None))
 
     def delivered(self, hint: Pose | None, guess: PlaceGuess | None) -> None:
-        """Offer no more the pose and the guess that went with a frame."""
+        """Stop offering the pose and the guess that a frame carried."""
         if hint is self.T_map_body:
             self._pending = False
         if guess is self.pending_guess:
             self.pending_guess = None
 
     def forget(self) -> None:
-        """Drop everything because a client asks; the file for the next start is to go as well."""
+        """Drop everything at a client's request; the file for the next start is deleted too."""
         self.drop()
         self.offer_guess(None)
         self.forgotten += 1
@@ -180,54 +180,54 @@ class PlaceHints:
 class QueuedFrame(NamedTuple):
     """A frame for the tracking engine, waiting or under way."""
 
-    job: FrameJob  # the frame, as the engine gets it
+    job: FrameJob  # the frame as sent to the engine
     paired: PairedFrame  # the frame with its odometry
-    waiting_since: float  # local time from which on a frame of this robot has been waiting
+    waiting_since: float  # local time since when a frame of this robot has waited
 
 
 class EngineQueue:
-    """One robot's work for the engines, from one reset of its session to the next; the session holds the lock.
+    """One robot's work for the engines between two resets of its session; the session holds the lock.
 
-    Of frames and of search requests only the newest waits, and one of each is under way. The result of a search waits
-    here too: it goes to the tracking engine with the next frame. Jobs issued before a reset are ignored; jobs of an old
-    odometry epoch are only counted.
+    At most one frame and one search request wait, the newest, and one of each is under way. A search result also
+    waits here: it goes to the tracking engine with the next frame. Jobs from before a reset are ignored; jobs of an
+    old odometry epoch are only counted.
     """
 
     def __init__(self, robot: str, epoch: int, counters: Counters, errors: ErrorLog) -> None:
-        """Begin with nothing to do in odometry epoch ``epoch``, which no job of this robot has had before."""
+        """Start without work in odometry epoch ``epoch``, which no earlier job of this robot has had."""
         self.robot = robot
-        self._first_epoch = self.epoch = epoch  # number of the robot's odometry frame
+        self._first_epoch = self.epoch = epoch  # id of the robot's odometry frame
         self._counters = counters
         self._errors = errors
         self.latency = Latency()  # from the arrival of a cloud to its fix
-        self.engine_latency = Latency()  # the engine's part of it
-        self.longest_wait = 0.0  # most seconds that a frame of this robot has been waiting
-        # most seconds from a keyframe to the end of its search; it inherits the wait of one that it replaces
+        self.engine_latency = Latency()  # the engine's share of it
+        self.longest_wait = 0.0  # longest wait of a frame of this robot, seconds
+        # longest time from a keyframe to the end of its search, seconds; it inherits the wait of one it replaces
         self.longest_search_wait = 0.0
         self.processed_at: float | None = None  # local time of the newest fix
         self._search_epoch: Epoch | None = None
-        self._searches = self._support = 0  # in that epoch, as of SearchDemand
+        self._searches = self._support = 0  # in that epoch, as in SearchDemand
         self._forget_epoch()
 
     def _forget_epoch(self) -> None:
-        self.considered: Considered | None = None  # places of the newest search; None once there is a place
+        self.considered: Considered | None = None  # places in the newest search; None once there is a place
         self._frame: QueuedFrame | None = None
         self._frame_under_way: QueuedFrame | None = None
         self._doubting: Job | None = None  # the job under way, if it contradicts the place
-        self._frame_done: QueuedFrame | None = None  # the newest one
+        self._frame_done: QueuedFrame | None = None  # the newest processed frame
         self._search_result: SearchResult | None = None
         self._request: SearchRequest | None = None
-        self._requested_at: float | None = None  # local time from which a keyframe has been waiting
-        self._searching_since: float | None = None  # the same of the keyframe under way
+        self._requested_at: float | None = None  # local time since when a keyframe has waited
+        self._searching_since: float | None = None  # the same for the keyframe under way
 
     def begin_epoch(self, epoch: int) -> None:
-        """Drop all frames and requests, waiting or under way: there is another odometry frame."""
+        """Drop all frames and requests, waiting or under way: the odometry frame has changed."""
         self._counters.dropped += self._frame is not None
         self.epoch = epoch
         self._forget_epoch()
 
     def put_frame(self, frame: PairedFrame, now: float) -> None:
-        """Make a frame the next one; a frame that waits already is dropped, and the engine is behind."""
+        """Make a frame the next one; a frame already waiting is dropped: the engine is behind."""
         message, waiting = frame.message, self._frame
         self._counters.dropped += waiting is not None
         job = FrameJob(
@@ -245,27 +245,27 @@ class EngineQueue:
 
     @property
     def has_frame(self) -> bool:
-        """Whether a frame may be taken; without the lock: perhaps no more."""
+        """Whether a frame may be taken; read without the lock, so it may be gone."""
         return self._frame is not None and self._frame_under_way is None
 
     @property
     def has_result(self) -> bool:
-        """Whether the result of a search waits for a frame; without the lock: perhaps no more."""
+        """Whether a search result waits for a frame; read without the lock, so it may be gone."""
         return self._search_result is not None and self._frame_under_way is None
 
     @property
     def searching(self) -> bool:
-        """Whether a search waits or is under way."""
+        """Whether a search is waiting or running."""
         return self._request is not None or self._searching_since is not None
 
     @property
     def idle(self) -> bool:
-        """Whether nothing waits and nothing is under way."""
+        """Whether nothing is waiting or under way."""
         waiting = (self._frame, self._frame_under_way, self._search_result, self._request, self._searching_since)
         return all(work is None for work in waiting)
 
     def take_result(self) -> FrameJob | None:
-        """Hand out the result of a search without a frame; None without one, or while a frame waits or is under way."""
+        """Hand out a search result without a frame; None without one, or while a frame waits or is under way."""
         done, result = self._frame_done, self._search_result
         if result is None or done is None or self._frame is not None or self._frame_under_way is not None:
             return None
@@ -277,7 +277,7 @@ class EngineQueue:
         return job
 
     def take_frame(self, require_verification: bool, hints: PlaceHints) -> FrameJob | None:
-        """Hand out the newest frame, with the result of a search if one has come; None while one is under way."""
+        """Hand out the newest frame with any search result; None without one, or while one is under way."""
         if self._frame is None or self._frame_under_way is not None:
             return None
         hint = hints.pending
@@ -315,7 +315,7 @@ class EngineQueue:
         return frame
 
     def frame_failed(self, job: FrameJob, reason: str, rejected: bool) -> bool:
-        """Count a frame of no use (``rejected``) or an engine's failure at it; return whether that still matters."""
+        """Count a useless frame (``rejected``) or an engine failure at it; return whether that still matters."""
         if job.epoch < self._first_epoch:
             return False
         self._counters.count("rejected" if rejected else "engine_errors")
@@ -325,7 +325,7 @@ class EngineQueue:
             return False
         self._frame_under_way = self._doubting = None
         if job.points is not None:
-            # perhaps not applied: it goes with the next frame too, and applied twice it changes nothing
+            # it may not have been applied, so the next frame carries it too; applied twice it changes nothing
             self._search_result = self._search_result or job.search_result
         return True
 
@@ -339,19 +339,19 @@ class EngineQueue:
         return self._frame_under_way is not None and self._frame_under_way.job is self._doubting
 
     def put_search_request(self, request: SearchRequest, now: float) -> None:
-        """Make a request the next one; a request that waits already is skipped, and its wait goes on."""
+        """Make a request the next one; a request already waiting is skipped, and its waiting time continues."""
         self._counters.searches_skipped += self._request is not None
         if request.epoch != self._search_epoch:
             self._search_epoch, self._requested_at = request.epoch, None
             self._searches = self._support = 0
         waiting = self._request
         if waiting is not None and waiting.epoch == request.epoch and not request.earlier:
-            request = replace(request, earlier=waiting.earlier)  # keyframes of before the search began anew
+            request = replace(request, earlier=waiting.earlier)  # keyframes from before the search restarted
         self._request = request
         self._requested_at = now if self._requested_at is None else self._requested_at
 
     def pending_search(self, now: float) -> str:
-        """Return how long the search that waits or runs has taken, and the frames dropped so far; empty for none."""
+        """Return how long a search has waited or run, and the number of dropped frames; empty without a search."""
         since = self._requested_at if self._searching_since is None else self._searching_since
         if since is None:
             return ""
@@ -361,14 +361,14 @@ class EngineQueue:
 
     @property
     def search_demand(self) -> SearchDemand | None:
-        """Demand for a search; None without a keyframe, or while a search is under way. Without the lock."""
+        """The robot's demand for a search; None without a keyframe or while a search runs. Read without the lock."""
         since = self._requested_at
         if since is None or self._searching_since is not None:
             return None
         return SearchDemand(since, self._searches, self._support)
 
     def take_search_request(self) -> SearchJob | None:
-        """Hand out the newest request; None while one is under way."""
+        """Hand out the newest request; None without one, or while one is under way."""
         if self._request is None or self._searching_since is not None:
             return None
         job = SearchJob(self.robot, self._request)
@@ -377,9 +377,9 @@ class EngineQueue:
         return job
 
     def search_done(self, job: SearchJob, result: SearchResult, now: float) -> None:
-        """Count a search; its result goes with the next frame.
+        """Count a search; the next frame carries its result.
 
-        An acceptance that still waits goes before a later result, which comes from a search that began again.
+        A waiting acceptance takes precedence over a later result, which comes from a restarted search.
         """
         if job.epoch < self._first_epoch:
             return
@@ -391,7 +391,7 @@ class EngineQueue:
         self._searching_since = None
         self.considered = result.considered
         if result.accepted is not None:
-            self._request = self._requested_at = None  # a keyframe that came meanwhile need not be searched for
+            self._request = self._requested_at = None  # no search for a keyframe that came meanwhile
         if job.request.epoch == self._search_epoch:
             self._searches += 1
             self._support = self._support + 1 if result.evidence.state is State.AMBIGUOUS else 0
@@ -399,7 +399,7 @@ class EngineQueue:
             self._search_result = result
 
     def search_failed(self, job: SearchJob, reason: str) -> None:
-        """Count a search that failed; it costs this keyframe's vote only."""
+        """Count a failed search; only this keyframe's vote is lost."""
         if job.epoch < self._first_epoch:
             return
         self._counters.search_errors += 1

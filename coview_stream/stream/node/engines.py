@@ -1,7 +1,7 @@
-"""Engines of many robots: the quick one tracks, the slow one searches, a third one computes lidar odometry.
+"""The engines, each for many robots: one tracks, a slow one searches, a third computes lidar odometry.
 
-They share only the map's file, so each can have a process of its own: a search must delay neither the frames of
-other robots nor the pose clock. The odometry engine needs no map.
+They share only the map file, so each can have its own process: a search must not delay the frames of other robots or
+the pose clock. The odometry engine needs no map.
 """
 
 from __future__ import annotations
@@ -31,11 +31,11 @@ from coview_stream.stream.node.inputs import OdometryJob, OdometryResult
 
 
 class Engine(ABC):
-    """Works through jobs one at a time; an exception concerns the job's robot only.
+    """Works through jobs one at a time; an exception affects the job's robot only.
 
     Attributes:
-        kernels: that its first jobs launch, to be compiled before them.
-        later_kernels: that only later jobs launch, to be compiled between jobs.
+        kernels: kernels of its first jobs, compiled beforehand.
+        later_kernels: kernels of later jobs only, compiled between jobs.
         on_doubt: called during a job if its frame contradicts the robot's place.
     """
 
@@ -58,14 +58,14 @@ class Engine(ABC):
         """Prepare for later jobs, in the first pause."""
 
     def rest(self) -> None:  # noqa: B027 - likewise
-        """Give back memory that later jobs read or make again, in a longer pause."""
+        """Free memory that later jobs read or compute again, in a longer pause."""
 
 
 class TrackEngine(Engine):
-    """Localizers of all robots: deskewing, keyframes, registration around a known place."""
+    """Localizers of all robots: deskewing, keyframes, registration near a known place."""
 
     kernels = ("transform_unique",)
-    # of robots that have driven a metre, and of those that have a place to be tracked from
+    # for robots that have driven a metre, and for those with a place to track from
     later_kernels = ("nearest", "align_planes", "crop_points", "field_scores", "PointGrid")
 
     def __init__(self, base_map: BaseMap, config: LocalizerConfig | None = None) -> None:
@@ -73,14 +73,14 @@ class TrackEngine(Engine):
         self.config = config or LocalizerConfig()
         self._local_maps = LocalMaps(base_map, self.config.registration.source_range)
         self._robots: dict[str, tuple[int, int, Localizer]] = {}  # first epoch, epoch
-        # without its weights: it only lists the contents of requests, for the search engine
+        # without its weights: it only lists the contents of requests for the search engine
         self._index = SearchIndex.of(base_map, self.config, load=False)
 
     def run(self, job: Job) -> FrameResult:
-        """Take in one frame; CloudError or RunError: it is unusable and changes nothing.
+        """Process one frame; CloudError or RunError: it is unusable and changes nothing.
 
-        Its search result, hint or demand to verify the place may have been applied; applied again with the next frame
-        they change nothing.
+        Its search result, hint or request to verify the place may have been applied; applying them again with the next
+        frame changes nothing.
         """
         if not isinstance(job, FrameJob):
             raise TypeError(f"{type(job).__name__}: the tracking engine does frames")
@@ -98,13 +98,13 @@ class TrackEngine(Engine):
         if job.require_verification:
             localizer.require_verification()
         if job.calibration is not None:
-            with contextlib.suppress(InputError):  # a hint of no use is no reason to drop the frame
+            with contextlib.suppress(InputError):  # a useless hint is no reason to drop the frame
                 localizer.hint_calibration(job.calibration)
         if job.hint is not None:
             with contextlib.suppress(RunError):
                 localizer.hint_pose(job.hint)
         if job.guess is not None:
-            localizer.guess_place(job.guess, check=False)  # the node has said that it is taken
+            localizer.guess_place(job.guess, check=False)  # the node has accepted it
         points = job.points
         if points is None:
             return FrameResult(localizer.fix(), None, time.perf_counter() - begin, localizer.take_events())
@@ -119,15 +119,15 @@ class TrackEngine(Engine):
         self._robots.pop(robot, None)
 
     def prepare_later(self) -> None:
-        """Load the field that a slip of odometry is judged by."""
+        """Load the likelihood field, which judges a slip of odometry."""
         _ = self.base_map.field.layers
 
 
 class SearchEngine(Engine):
-    """Global searches of all robots, which share the map's spectra and networks."""
+    """Global searches for all robots, which share the map's spectra and networks."""
 
     kernels = GlobalSearch.KERNELS
-    # of learned features, and of a place that has been accepted
+    # for learned features, and for an accepted place
     later_kernels = ("height_columns", "window_products", "PointGrid")
 
     def __init__(self, base_map: BaseMap, config: LocalizerConfig | None = None) -> None:
@@ -152,14 +152,14 @@ class SearchEngine(Engine):
         self._searches.pop(robot, None)
 
     def prepare(self) -> None:
-        """Prepare the stations' index, the learned features and the field for the first query."""
+        """Prepare the station index, the learned features and the field for the first query."""
         GlobalSearch(self.base_map, self.config, self._local_maps, self._index).prepare()
         self.rest()
 
     def rest(self) -> None:
-        """Drop crops of the map, and the pages of its file: the system keeps these, an eighth of a second a gigabyte.
+        """Drop crops of the map and pages of its file; the system caches the pages: 1/8 s per gigabyte to map again.
 
-        Searches have looked at the whole map, and while robots are tracked none comes.
+        Searches have read the whole map, and there are none while robots are tracked.
         """
         self._local_maps.clear()
         for array in self.base_map.arrays.values():
@@ -170,14 +170,14 @@ class OdometryEngine(Engine):
     """One :class:`LidarOdometry` per robot, each with its own ``registration``.
 
     Raises:
-        DependencyError: kiss-icp is missing, or cannot be loaded; the message says how to get it.
+        DependencyError: kiss-icp is missing or cannot be loaded; the message says how to get it.
     """
 
     def __init__(self, registration: Callable[[LidarOdometryConfig], ScanRegistration] = KissRegistration) -> None:
         self._registration = registration
         self._robots: dict[str, tuple[int, LidarOdometry]] = {}
         self._trajectories: dict[str, tuple[int, int]] = {}  # epoch and restarts at the newest pose
-        registration(LidarOdometryConfig())  # a missing library shows now rather than at the first frame
+        registration(LidarOdometryConfig())  # reports a missing library now, not at the first frame
 
     def run(self, job: Job) -> OdometryResult:
         """Return the odometry of one frame; CloudError or RunError: it cannot be placed, the next one may be."""
@@ -204,20 +204,20 @@ class OdometryEngine(Engine):
 
 
 KINDS: dict[str, type[Engine]] = {"odometry": OdometryEngine, "track": TrackEngine, "search": SearchEngine}
-"""Engines by their names."""
+"""Engines by name."""
 
 
 def open_engine(
     kind: str, map_path: str | Path, sha256: str, config: LocalizerConfig | None = None, trust: Trust | None = None
 ) -> Engine:
-    """Return a new engine of the kind that :data:`KINDS` names; those that track and search load the map's file.
+    """Return a new engine of a kind in :data:`KINDS`; the tracking and search engines load the map file.
 
-    The node has checked the file. It may have been replaced since, so its hash must still be ``sha256``. With
-    ``trust`` its signature is verified again, unless the file is the one that the node has verified, unchanged.
+    The node has checked the file, but it may have been replaced since, so its hash must still be ``sha256``. With
+    ``trust`` its signature is verified again, unless the file that the node has verified is unchanged.
 
     Raises:
-        MapError: an unusable map, not signed, or another one than ``sha256`` says. DependencyError: no kiss-icp, or
-            no ``cryptography``. InputError, DependencyError: ``config`` wants learned features, which cannot be used.
+        MapError: the map is unusable, unsigned, or not the one of ``sha256``. DependencyError: no kiss-icp or no
+            ``cryptography``. InputError, DependencyError: ``config`` needs learned features, which cannot be used.
     """
     if kind == "odometry":
         return OdometryEngine()

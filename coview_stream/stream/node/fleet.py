@@ -1,11 +1,11 @@
-"""Fleet of nodes that share robots: each robot is served by one node, and another takes over when that one goes.
+"""Fleet of nodes that share robots: one node serves each robot, and another takes over when that node goes.
 
-Every node ranks all nodes that are alive for each robot by a hash of both names (rendezvous hashing), and the first one
-serves it: no coordinator, no ranges to configure. When a node goes only its robots move, to all others alike. A node
-is alive that holds a liveliness token and tells the others the places of its robots once a second: a token goes at once
-with its process, but any session may hold one. That a node serves a robot is believed of the robot's statuses alone: a
-robot is given up once a node that ranks higher has sent one, and taken by another when none has come for 3 s. A node
-whose engines have not been ready for 7 s tells nothing, ranks last, and takes no robots on while there are others.
+For each robot every node ranks all live nodes by a hash of both names (rendezvous hashing), and the first one serves
+it: no coordinator, no ranges to configure. When a node goes only its robots move, spread evenly over the others. A
+node is alive if it holds a liveliness token and sends its robots' places to the others once a second: a token
+vanishes with its process, but any session may hold one. Only a robot's statuses prove that a node serves it: a node
+gives a robot up once a higher-ranked node has sent one, and another node takes it when none has come for 3 s. A node
+whose engines have not been ready for 7 s is silent, ranks last, and takes no robots on while there are other nodes.
 """
 
 from __future__ import annotations
@@ -30,19 +30,19 @@ from coview_stream.stream.transport.transport import Transport
 log = logging.getLogger("coview_stream.node")
 
 LEASE_MS = 1000
-"""Milliseconds without a sign of life after which the network takes a node for dead, to be replaced within 3 s."""
+"""Milliseconds without a sign of life after which the network drops a node, to be replaced within 3 s."""
 
-_MISSED = 2  # looks in a row that do not show a node, before it counts as gone
-_LOOK = 0.1  # seconds between two looks at the tokens
-_TELL = 1.0  # seconds between two messages of the robots' places
-_SILENT = 30  # looks in a row without such a message, 3 s, before a token alone counts for nothing; as of statuses
-_UNREADY = 70  # looks in a row, 7 s, at engines that are not ready: one that died has been started again sooner
+_MISSED = 2  # looks in a row that miss a node, before it counts as gone
+_LOOK = 0.1  # seconds between looks at the tokens
+_TELL = 1.0  # seconds between messages with the robots' places
+_SILENT = 30  # looks without such a message, 3 s, after which a token alone does not count; the same for statuses
+_UNREADY = 70  # looks in a row, 7 s, that find engines not ready: a dead engine restarts sooner
 _MAX_HEARD = 1024  # messages between two looks
 _MAX_BYTES = 4 << 20  # of such a message that are read
 
 
 def owner(robot: str, nodes: Collection[str]) -> str | None:
-    """Return the node that serves a robot; None of no nodes."""
+    """Return the node that serves a robot; None if there are no nodes."""
 
     def rank(node: str) -> tuple[bytes, str]:
         return hashlib.blake2b(f"{robot}\n{node}".encode(), digest_size=8).digest(), node
@@ -55,30 +55,30 @@ def _names(nodes: Collection[str]) -> str:
 
 
 class FleetMembers:
-    """The nodes of a fleet that are alive: they hold a liveliness token and have been heard in the last 30 looks. Pure.
+    """The live nodes of a fleet: they hold a liveliness token and were heard in the last 30 looks. Pure logic.
 
-    A look that does not show ``node`` itself tells nothing: this node is cut off.
+    A look that does not show ``node`` itself says nothing: this node is cut off.
     """
 
     def __init__(self, node: str) -> None:
         self._node = node
         self._missed: dict[str, int] = {node: 0}
-        self.looks = 0  # that showed this node: a clock that stands still with it
-        self._heard: dict[str, int] = {}  # look of the newest message of those who have a token
+        self.looks = 0  # looks that showed this node: a clock that stops when it is cut off
+        self._heard: dict[str, int] = {}  # look of the newest message, for each node with a token
         self._tokens: frozenset[str] = frozenset()
 
     @property
     def alive(self) -> frozenset[str]:
-        """Names, this node's among them."""
+        """Names of the live nodes, this node's among them."""
         return frozenset(self._missed)
 
     @property
     def settled(self) -> bool:
-        """Whether all who hold a token have been heard, or have had the time: until then robots may have a node."""
+        """Whether all token holders have been heard or had time to be: until then robots may have another node."""
         return self.looks > _SILENT or self._tokens <= self.alive
 
     def look(self, tokens: Collection[str], heard: Collection[str] = ()) -> bool:
-        """Take in who has a token now, and who was heard since the last look; return True if membership changed."""
+        """Take the token holders and the nodes heard since the last look; return whether membership changed."""
         if self._node not in tokens:
             return False
         before = self.alive
@@ -97,15 +97,15 @@ class FleetMembers:
 
 
 class Fleet:
-    """One node's part in a fleet, on a thread of its own: it takes robots on and gives them up.
+    """One node's part in a fleet, on its own thread: it takes robots on and gives them up.
 
     Args:
-        prefix: of the fleet's keys.
-        node: name of this node, unlike all others.
-        endpoints: of all robots of the fleet, by name; none of them is served yet.
-        transport: of tokens and places.
-        ready: tells whether this node's engines are.
-        period: seconds between two statuses of a robot, the same in all nodes.
+        prefix: first part of the fleet's keys.
+        node: name of this node, unique in the fleet.
+        endpoints: endpoints of all robots of the fleet, by name; none is served yet.
+        transport: carries tokens and places.
+        ready: whether this node's engines are ready.
+        period: seconds between statuses of a robot, the same in all nodes.
     """
 
     def __init__(
@@ -121,21 +121,21 @@ class Fleet:
         self.members = FleetMembers(node)
         self._endpoints = endpoints
         self._transport = transport
-        self._ready, self._unready = ready, 0  # looks in a row at engines that were not
+        self._ready, self._unready = ready, 0  # looks in a row that found engines not ready
         self._errors = RateLimitedErrors(log)
-        self._heard: deque[str] = deque(maxlen=_MAX_HEARD)  # nodes that have told something since the last look
+        self._heard: deque[str] = deque(maxlen=_MAX_HEARD)  # nodes that have sent something since the last look
         self._told = self._logged_at = float("-inf")  # local time
-        self._logged = frozenset({node})  # nodes that were alive at the newest log line about that
-        self._ranked: frozenset[str] = frozenset()  # nodes by which robots have been shared; none before the first look
+        self._logged = frozenset({node})  # live nodes in the newest log line about them
+        self._ranked: frozenset[str] = frozenset()  # nodes that last shared the robots; empty before the first look
         self._owners: dict[str, str | None] = {}  # of the robots, among these nodes
         self._patience = max(_SILENT, round(3.0 * period / _LOOK))  # looks without a status of a robot
         self._statuses: dict[tuple[str, str], bool] = {}  # since the last look, by robot and node: whether it ends
-        self._lock = threading.Lock()  # of these
-        self._servers: dict[str, dict[str, int]] = {robot: {} for robot in endpoints}  # look of each node's newest
+        self._lock = threading.Lock()  # guards the statuses
+        self._servers: dict[str, dict[str, int]] = {robot: {} for robot in endpoints}  # look of a node's newest status
         self._served: dict[str, int] = {}  # newest look at which each robot was known to be served
         self.unserved: tuple[str, ...] = ()  # robots that no node is known to serve
-        self._places: dict[str, LastPlace] = {}  # of robots of other nodes, as these told
-        self._arriving: dict[str, LastPlace] = {}  # of robots that were taken on, and whose odometry has not come yet
+        self._places: dict[str, LastPlace] = {}  # of other nodes' robots, as sent by these
+        self._arriving: dict[str, LastPlace] = {}  # of robots taken on whose odometry has not come yet
         self._publisher = transport.publisher(f"{prefix}/places/{node}", "data")
         transport.subscribe(f"{prefix}/places/*", self._on_places, "all")
         transport.subscribe(f"{prefix.rsplit('/', 2)[0]}/*/out/status", self._on_status, "all")
@@ -143,7 +143,7 @@ class Fleet:
         log.info("%s: this node is %s", prefix, node)
 
     def run(self, stopping: threading.Event) -> None:
-        """Look, and tell, until ``stopping``."""
+        """Look at the fleet and send places until ``stopping``."""
         while not stopping.wait(_LOOK):
             with self._errors.catch("fleet"):
                 self.look()
@@ -154,7 +154,7 @@ class Fleet:
             self.tell()
 
     def look(self) -> None:
-        """Look who is alive, take robots on and give them up."""
+        """Check which nodes are alive, take robots on and give them up."""
         begin = f"{self.prefix}/nodes/"
         try:
             tokens = {token.removeprefix(begin) for token in self._transport.tokens(f"{begin}*")}
@@ -164,7 +164,7 @@ class Fleet:
         self.members.look(tokens, [self._heard.popleft() for _ in range(len(self._heard))])
         after = self.members.alive
         if after - before:
-            self._told = float("-inf")  # one that has come does not know this node yet
+            self._told = float("-inf")  # a new node does not know this one yet
         if after != self._logged and time.monotonic() - self._logged_at > _TELL:
             changes = ((after - self._logged, "came"), (self._logged - after, "went"))
             log.info(
@@ -185,7 +185,7 @@ class Fleet:
                 del self._arriving[robot]
 
     def _share(self) -> None:
-        """Give up robots that a higher-ranked node serves; take those of this node and those without any."""
+        """Give up robots that a higher-ranked node serves; take on this node's robots and those without a node."""
         alive, look = self.members.alive, self.members.looks
         if alive != self._ranked:
             self._ranked, self._owners = alive, {robot: owner(robot, alive) for robot in self._endpoints}
@@ -218,7 +218,7 @@ class Fleet:
 
     def _move(self, given_up: Collection[str], taken: Collection[str]) -> None:
         if given_up:
-            self.tell()  # the newest places, before they are forgotten
+            self.tell()  # sends the newest places before they are forgotten
         for name in given_up:
             self._arriving.pop(name, None)
             self._endpoints[name].end_serving()
@@ -232,7 +232,7 @@ class Fleet:
         log.info("fleet: %d robots taken on, %d given up; %d are this node's", len(taken), len(given_up), own)
 
     def tell(self) -> None:
-        """Tell the others that this node is alive, and the places of its robots; not without engines."""
+        """Send the places of this node's robots, which shows that it is alive; silent without engines."""
         if self._unready >= _UNREADY:
             return
         places = {}
@@ -251,7 +251,7 @@ class Fleet:
                 if name in self._endpoints and not self._endpoints[name].serving:
                     self._places[name] = LastPlace.from_message(plain)
         except (ValueError, TypeError, KeyError, AttributeError, RecursionError, OverflowError) as error:
-            self._errors.report(f"{self.prefix}/places", error)  # one place: strangers choose their names
+            self._errors.report(f"{self.prefix}/places", error)  # a single place: strangers choose their names
 
     def _on_status(self, sample: Sample) -> None:
         robot = sample.key.split("/")[-3]

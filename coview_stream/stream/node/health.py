@@ -1,4 +1,4 @@
-"""Health of a node for its operators: a document over zenoh and HTTP, metrics for Prometheus, notices to systemd."""
+"""Health of a node for its operators: a document over zenoh and HTTP, Prometheus metrics, systemd notices."""
 
 from __future__ import annotations
 
@@ -26,17 +26,17 @@ from coview_stream.version import __version__
 
 log = logging.getLogger(__name__)
 
-_MAX_BEAT = 2.0  # seconds without a tick of the pose clock, besides two of its periods
+_MAX_BEAT = 2.0  # seconds without a tick of the pose clock, plus two of its periods
 _INTERVAL = 1.0  # seconds between two documents
 
 
 class NodeHealth:
     """Health of a node.
 
-    It is *live* as long as its pose clock ticks and none of its threads has ended: otherwise it has to be started
-    again. It is *ready* when a robot's messages would be used now: its engines have opened the map, it is connected,
-    if it ``needs_connection``, and no robot of its ``fleet``, if any, is without a node. ``follower`` is of the map's
-    sources elsewhere, if any.
+    It is *live* while its pose clock ticks and no thread has ended; otherwise it must be restarted. It is *ready*
+    when a robot's messages would be used now: its engines have opened the map, it is connected if it
+    ``needs_connection``, and every robot of its ``fleet``, if any, has a node. ``follower`` follows the map's remote
+    sources, if any.
     """
 
     def __init__(
@@ -71,7 +71,7 @@ class NodeHealth:
         return reasons
 
     def document(self) -> dict[str, Any]:
-        """Return everything as plain data; of robots, those that this node serves."""
+        """Return everything as plain data; only robots that this node serves."""
         node = self._node
         live, ready = self.live_reasons(), self.ready_reasons()
         feed = node.feeds[0]
@@ -109,7 +109,7 @@ class NodeHealth:
         }
 
     def answer(self, keys: NodeKeys) -> None:
-        """Answer queries for the document, and for a change of the map."""
+        """Answer queries for the document and for a change of the map."""
         self._node.transport.answer(keys.ask_health, lambda parameters: self.document())
         self._node.transport.answer(keys.reload, lambda parameters: self._node.reload())
 
@@ -117,15 +117,15 @@ class NodeHealth:
         """Publish the document once a second until ``stopping`` is set."""
         publisher = self._node.transport.publisher(keys.health, "report")
         while not stopping.wait(_INTERVAL):
-            with self._errors.catch("health"):  # one document that fails must not end the others
+            with self._errors.catch("health"):  # one failed document must not end the others
                 publisher.put(Encoded(json.dumps(self.document()).encode(), "application/json"))
 
 
 def metrics_server(address: str, document: Callable[[], dict[str, Any]]) -> HttpServer:
-    """Return a server of ``/metrics`` (Prometheus) and ``/health`` (JSON; 200 if the node is ready, else 503).
+    """Return a server for ``/metrics`` (Prometheus) and ``/health`` (JSON; 200 if the node is ready, else 503).
 
     Raises:
-        ConfigError: ``address`` is no ``HOST:PORT``, or cannot be listened on.
+        ConfigError: ``address`` is not ``HOST:PORT``, or cannot be bound.
     """
 
     def metrics(_: str) -> Reply:
@@ -142,7 +142,7 @@ def metrics_server(address: str, document: Callable[[], dict[str, Any]]) -> Http
 
 
 def prometheus_text(document: Mapping[str, Any]) -> str:
-    """Return a document of :class:`NodeHealth` in Prometheus' text format, version 0.0.4."""
+    """Return a document of :class:`NodeHealth` in the Prometheus text format, version 0.0.4."""
     lines: list[str] = []
 
     def add(name: str, kind: str, text: str, samples: Iterable[tuple[Mapping[str, str], float | None]]) -> None:
@@ -185,7 +185,7 @@ def prometheus_text(document: Mapping[str, Any]) -> str:
 
 
 def _memory(pid: int) -> int | None:
-    """Return the resident memory of a process, bytes; None where there is no ``/proc``."""
+    """Return the resident memory of a process, bytes; None without ``/proc``."""
     try:
         return int(Path(f"/proc/{pid}/statm").read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE")
     except (OSError, ValueError, IndexError):
@@ -193,10 +193,10 @@ def _memory(pid: int) -> int | None:
 
 
 class Notifier:
-    """Sends notices to systemd; never waits, and never fails.
+    """Sends notices to systemd; never waits and never fails.
 
     Attributes:
-        watchdog_period: seconds between two signs of life, half of the limit that systemd sets; None if it wants none.
+        watchdog_period: seconds between signs of life, half of systemd's limit; None if it wants none.
     """
 
     def __init__(self, environment: Mapping[str, str] = os.environ) -> None:
@@ -216,24 +216,24 @@ class Notifier:
             notify.sendto("\n".join(lines).encode(), self._address)
 
     def ready(self, status: str) -> None:
-        """Tell that the service is up, with one line for ``systemctl status``; not any more once it ends."""
+        """Report that the service is up, with one line for ``systemctl status``; ignored once the service ends."""
         if not self._ends:
             self.send("READY=1", f"STATUS={status}")
 
     def reloading(self, busy: bool, status: str) -> None:
-        """Tell that a change of the map begins, or that it is over."""
+        """Report that a change of the map begins or is over."""
         if not busy:
             self.ready(status)
         elif not self._ends:
             self.send("RELOADING=1", f"MONOTONIC_USEC={time.monotonic_ns() // 1000}", f"STATUS={status}")
 
     def stopping(self) -> None:
-        """Tell that the service ends."""
+        """Report that the service ends."""
         self._ends = True
         self.send("STOPPING=1")
 
     def run(self, stopping: threading.Event, live: Callable[[], bool]) -> None:
-        """Give signs of life, as long as there is life, until ``stopping`` is set."""
+        """Send signs of life while the service is live, until ``stopping`` is set."""
         while self.watchdog_period is not None and not stopping.wait(self.watchdog_period):
             if live():
                 self.send("WATCHDOG=1")

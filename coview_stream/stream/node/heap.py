@@ -1,8 +1,8 @@
-"""Settings of the C library's heap, where it is glibc's.
+"""Settings of the C library's heap, if it is glibc's.
 
-By default each thread has a heap of its own, up to eight for each core. Messages of a megabyte pass through most
-threads of a node, and every heap keeps the most that it has ever held, in pieces: resident memory grew for hours by
-100 kB with each fault of a link or a robot, though no byte more was in use.
+By default each thread has its own heap, up to eight per core. Messages of a megabyte pass through most threads of a
+node, and every heap keeps, in pieces, the most it has ever held: resident memory grew for hours, by 100 kB with each
+fault of a link or a robot, although no more bytes were in use.
 """
 
 from __future__ import annotations
@@ -11,14 +11,14 @@ import contextlib
 import ctypes
 import os
 
-_ARENA_MAX, _MMAP_THRESHOLD = -8, -3  # names of mallopt's settings in malloc.h
-_LARGE = 1 << 18  # bytes: a larger piece is mapped, and unmapped when it is free; 0.1 ms for a cloud
+_ARENA_MAX, _MMAP_THRESHOLD = -8, -3  # numbers of mallopt's settings in malloc.h
+_LARGE = 1 << 18  # bytes: a larger piece is mapped, and unmapped when freed; 0.1 ms for a cloud
 
 
 def bound_heaps(number: int, map_large: bool = False) -> None:
-    """Let all threads share so many heaps; ``map_large`` keeps large pieces out of them. Before threads are started.
+    """Make all threads share ``number`` heaps; ``map_large`` keeps large pieces out. Call it before starting threads.
 
-    The user's own settings, ``MALLOC_ARENA_MAX`` and ``MALLOC_MMAP_THRESHOLD_``, stay.
+    The user's own settings, ``MALLOC_ARENA_MAX`` and ``MALLOC_MMAP_THRESHOLD_``, take precedence.
     """
     with contextlib.suppress(OSError, AttributeError, TypeError):  # another C library
         library = ctypes.CDLL(None)
@@ -29,6 +29,6 @@ def bound_heaps(number: int, map_large: bool = False) -> None:
 
 
 def return_free_memory() -> None:
-    """Give the free memory of the heaps back to the system: after a search, tens of megabytes."""
+    """Return the heaps' free memory to the system: tens of megabytes after a search."""
     with contextlib.suppress(OSError, AttributeError, TypeError):
         ctypes.CDLL(None).malloc_trim(0)

@@ -1,7 +1,7 @@
 """Inputs of one robot: clouds and odometry, decoded and paired by their stamps.
 
-A robot that sends no odometry has its odometry computed from its clouds (:class:`LidarInputs`). Pure logic, as the
-session, which holds the lock.
+For a robot without odometry it is computed from the clouds (:class:`LidarInputs`). Pure logic; the session, which is
+pure too, holds the lock.
 """
 
 from __future__ import annotations
@@ -28,10 +28,10 @@ from coview_stream.stream.transport.keys import RobotKeys
 
 _NS = 1_000_000_000
 _NEVER = float("-inf")
-_RESTARTED_NS = 5 * _NS  # a stamp that lies farther back than this is a restarted clock
+_RESTARTED_NS = 5 * _NS  # a stamp farther back than this means a restarted clock
 _COMES = {"clouds": "come", "odometry": "comes"}
-_MAX_WAITING = 8  # frames that wait for their odometry
-_MAX_LIDAR_WAITING = 2  # frames that wait for the odometry engine: it needs every frame, but no old one
+_MAX_WAITING = 8  # frames that wait for odometry
+_MAX_LIDAR_WAITING = 2  # frames that wait for the odometry engine: it needs every frame, but no old ones
 _END_WAIT = 0.15  # seconds that a frame waits for odometry up to its last point
 
 _COUNTED_AS = {
@@ -51,10 +51,10 @@ _BREAKS = {
 
 
 class Break(NamedTuple):
-    """Interruption of the odometry: frames from before and after it must not be searched for as one place."""
+    """Interruption of odometry: frames from before and after must not be searched for as one place."""
 
     reason: str  # one clause for people
-    # after a short pause, the first stamp behind it: a place that is known need only be verified
+    # after a short pause, the first stamp after it: a known place need only be verified
     verify_from_ns: int | None = None
 
 
@@ -63,10 +63,10 @@ class OdometryJob:
     """One lidar frame for the odometry engine."""
 
     robot: str  # name
-    epoch: int  # number of its lidar odometry; a new one makes the engine begin it again
+    epoch: int  # id of its lidar odometry; a new one makes the engine restart it
     stamp_ns: int  # sensor time, nanoseconds
     points: Points  # (N, 3) float32 body frame, metres
-    times: Floats | None  # (N,) seconds after the stamp at which each point was measured; None for no deskewing
+    times: Floats | None  # (N,) seconds after the stamp at which each point was measured; None: no deskewing
     config: LidarOdometryConfig  # of its lidar odometry
 
 
@@ -76,12 +76,12 @@ class OdometryResult:
 
     T_odom_body: Pose  # (4, 4) odometry at its stamp
     points: Points | None  # (N, 3) deskewed; None if the job had no times
-    restarted: bool  # the pose is not connected to those before it
+    restarted: bool  # the pose is not connected to earlier ones
     seconds: float  # of the engine's work
 
 
 class ReceivedFrame(NamedTuple):
-    """A lidar frame, and the local time in seconds at which it came."""
+    """A lidar frame and its local arrival time, seconds."""
 
     message: CloudMessage
     received: float
@@ -92,29 +92,29 @@ class PairedFrame:
     """A lidar frame with its odometry."""
 
     message: CloudMessage  # the frame
-    received: float  # local time at which it came, seconds
+    received: float  # local arrival time, seconds
     T_odom_body: Pose  # (4, 4) odometry at its stamp
-    segment: Segment | None  # odometry while it was measured; None for no deskewing
-    travelled: float  # metres that odometry had driven at its stamp
-    turned: float  # radians that odometry had turned at its stamp
+    segment: Segment | None  # odometry while the frame was measured; None: no deskewing
+    travelled: float  # metres driven by odometry at its stamp
+    turned: float  # radians turned by odometry at its stamp
 
 
 class FrameSync:
-    """Frames in the order of their stamps, until odometry covers them; counts those that end here."""
+    """Frames in order of their stamps, until odometry covers them; counts frames that end here."""
 
     def __init__(self, config: NodeConfig, odometry: OdometryBuffer, counters: Counters) -> None:
         self.config = config
         self.odometry = odometry
         self.counters = counters
         self._waiting: list[ReceivedFrame] = []
-        self._passed_ns: int | None = None  # stamp of the newest frame that went on
+        self._passed_ns: int | None = None  # stamp of the newest frame handed out
 
     def __len__(self) -> int:
-        """Return how many frames wait."""
+        """Return the number of waiting frames."""
         return len(self._waiting)
 
     def add(self, message: CloudMessage, now: float) -> None:
-        """Add a frame that came at local time ``now``."""
+        """Add a frame that arrived at local time ``now``."""
         stamp_ns = message.stamp_ns
         if stamp_ns == self._passed_ns or any(f.message.stamp_ns == stamp_ns for f in self._waiting):
             self.counters.duplicate += 1
@@ -124,12 +124,12 @@ class FrameSync:
             self._waiting.append(ReceivedFrame(message, now))
             self._waiting.sort(key=lambda f: f.message.stamp_ns)
             if len(self._waiting) > _MAX_WAITING:
-                # the one that came first, not the oldest stamp: a stray stamp must not stay for ever
+                # by arrival, not by stamp: a stray stamp must not stay for ever
                 self._waiting.remove(min(self._waiting, key=lambda f: f.received))
                 self.counters.dropped += 1
 
     def take_paired(self, now: float) -> Iterator[PairedFrame]:
-        """Hand out the frames that have their odometry, oldest first; count those for which none came in time."""
+        """Hand out the frames with odometry, oldest first; count those for which none came in time."""
         for frame in list(self._waiting):
             message, waited = frame.message, now - frame.received
             where = self.odometry.covers(message.stamp_ns)
@@ -145,12 +145,12 @@ class FrameSync:
             self._passed_ns = message.stamp_ns
             deskewed = self.config.deskew and message.times is not None
             segment = self.odometry.around(*self._span(message)) if deskewed else None
-            driven, turned = self.odometry.driven_since(message.stamp_ns)  # it may have waited for a while
+            driven, turned = self.odometry.driven_since(message.stamp_ns)  # the frame may have waited
             travelled = self.odometry.travelled - driven
             yield PairedFrame(message, frame.received, pose, segment, travelled, self.odometry.turned - turned)
 
     def _span(self, message: CloudMessage) -> tuple[int, int]:
-        """First and last stamp (ns) at which the frame's points were measured."""
+        """First and last stamp, nanoseconds, at which the frame's points were measured."""
         if message.times is None or not self.config.deskew:
             return message.stamp_ns, message.stamp_ns
         times = np.nan_to_num(message.times, nan=0.0)
@@ -159,36 +159,36 @@ class FrameSync:
 
 
 class NewestStamp:
-    """The latest stamp of an input.
+    """The newest stamp of an input.
 
     Attributes:
-        came_at: local time of the newest message, with any stamp.
+        came_at: local time of the newest message, whatever its stamp.
     """
 
     def __init__(self) -> None:
-        self.came_at = self._later_at = _NEVER  # the second: of the newest message with a later stamp
+        self.came_at = self._later_at = _NEVER  # _later_at: of the newest message with a later stamp
         self._stamp_ns: int | None = None
 
     def add(self, stamp_ns: int, now: float) -> None:
-        """Note a message that came at local time ``now``."""
+        """Add a message that arrived at local time ``now``."""
         self.came_at = now
         if self._stamp_ns is None or stamp_ns > self._stamp_ns or stamp_ns < self._stamp_ns - _RESTARTED_NS:
             self._stamp_ns, self._later_at = stamp_ns, now
 
     def stands(self, now: float, longest: float) -> str:
-        """Return that messages come but for ``longest`` seconds none with a later stamp; empty otherwise."""
+        """Say that messages come, but for ``longest`` seconds none with a later stamp; empty otherwise."""
         if self._stamp_ns is None or now - self._later_at <= longest or now - self.came_at > longest:
             return ""
         return f"with no stamp after {self._stamp_ns * 1e-9:.3f} s for {now - self._later_at:.0f} s"
 
 
 class Inputs:
-    """Clouds and odometry of a robot that sends both, from one reset of its session to the next.
+    """Clouds and odometry of a robot that sends both, between two resets of its session.
 
-    ``codecs`` of clouds and odometry go before the messages' own encodings.
+    ``codecs`` for clouds and odometry override the messages' own encodings.
     """
 
-    odometry_source = "robot"  # or the library that computes the odometry here
+    odometry_source = "robot"  # or the library that computes odometry here
 
     def __init__(
         self,
@@ -204,30 +204,30 @@ class Inputs:
         self.counters = counters
         self.errors = errors
         self.odometry = OdometryBuffer(config)
-        # local time at which nothing was connected to the node: a pause of odometry says nothing about the robot then
+        # local time at which nothing was connected to the node: a pause of odometry then says nothing about the robot
         self.disconnected_at = _NEVER
         self._frames = FrameSync(config, self.odometry, counters)
         self._missing = MissingFrames()
         self._newest = {"clouds": NewestStamp(), "odometry": NewestStamp()}
-        self._mount: tuple[Mount | None] | None = None  # that the transport told with the newest cloud
+        self._mount: tuple[Mount | None] | None = None  # that the transport reported with the newest cloud
 
     def decode_cloud(self, sample: Sample) -> CloudMessage:
-        """Return a cloud in the body frame, with at most ``max_points``; MessageError: it cannot be read."""
+        """Return a cloud in the body frame, with at most ``max_points``; MessageError if it is unreadable."""
         message = decode_cloud(sample, self.codecs[0], self.keys.hint, self.config.max_payload)
         message = message.limited(self.config.max_points)
         return replace(message, points=(sample.mount or self.config.mount).to_body(message.points))
 
     def note_mount(self, mount: Mount | None) -> Break | None:
-        """Note the mount that the transport told with a cloud; return the break if it is another than before."""
+        """Take the mount that the transport reported with a cloud; return the break if it has changed."""
         before, self._mount = self._mount, (mount,)
         return None if before in (None, (mount,)) else Break("the lidar's pose on the body is another than before")
 
     def decode_odometry(self, sample: Sample) -> OdometryMessage:
-        """Return an odometry sample; MessageError: it cannot be read."""
+        """Return an odometry sample; MessageError if it is unreadable."""
         return decode_odometry(sample, self.codecs[1], self.keys.hint, self.config.max_payload)
 
     def count_undecodable(self, error: MessageError, key: str, prefix: str = "") -> None:
-        """Count a message that could not be decoded; log only the first one of a kind whose reasons all differ."""
+        """Count an undecodable message; of a kind whose reasons all differ, log only the first."""
         name = counter_of(error)
         self.counters.count(f"{prefix}received")
         self.counters.count(prefix + name)
@@ -237,7 +237,7 @@ class Inputs:
             self.errors.add_first(f"{key}: {name} messages", str(error).removeprefix(f"{key}: "))
 
     def add_cloud(self, message: CloudMessage, now: float) -> Break | None:
-        """Count a cloud and queue it; return the break if it does not continue those before it."""
+        """Count and queue a cloud; return the break if it does not continue the earlier ones."""
         self._newest["clouds"].add(message.stamp_ns, now)
         self.counters.received += 1
         self.counters.missing += self._missing.add(message.stamp_ns, message.sequence)
@@ -253,7 +253,7 @@ class Inputs:
         return None
 
     def add_odometry(self, message: OdometryMessage, now: float) -> Break | None:
-        """Add an odometry sample; return the break if it does not continue those before it."""
+        """Add an odometry sample; return the break if it does not continue the earlier ones."""
         self._newest["odometry"].add(message.stamp_ns, now)
         self.counters.odometry_received += 1
         unreachable = self.odometry_source == "robot" and self.disconnected_at > self.odometry.arrived
@@ -265,21 +265,21 @@ class Inputs:
         return Break(_BREAKS[kind], message.stamp_ns if kind is SampleKind.GAP else None)
 
     def take_paired(self, now: float) -> Iterator[PairedFrame]:
-        """Hand out the frames that have their odometry, oldest first."""
+        """Hand out the frames with odometry, oldest first."""
         return self._frames.take_paired(now)
 
     def drop_frames(self) -> None:
-        """Drop the frames that wait: they belong to an odometry frame that has ended."""
+        """Drop the waiting frames: their odometry frame has ended."""
         self.counters.dropped += len(self._frames)
         self._frames = FrameSync(self.config, self.odometry, self.counters)
 
     def continue_from(self, other: Inputs) -> None:
-        """Go on with the odometry of the robot's session on another map."""
+        """Continue with the odometry of the robot's session on another map."""
         self.odometry.continue_from(other.odometry)
         self._newest, self._mount = other._newest, other._mount
 
     def waiting_for(self) -> str:
-        """Return the missing input of a robot of which no frame has been processed."""
+        """Return the input that is missing, for a robot without a processed frame."""
         keys, counters = self.keys, self.counters
         has_odometry = self.odometry_source != "robot" or self.odometry.newest is not None
         if not counters.received:
@@ -299,7 +299,7 @@ class Inputs:
         return "no frame has been processed yet"
 
     def silent(self, now: float) -> str:
-        """Return the inputs that have not come for ``max_outage``, and for how long; empty for none."""
+        """Return the inputs that have not come for ``max_outage``, and since when; empty if none."""
         arrived = {"clouds": self._newest["clouds"].came_at}
         if self.odometry_source == "robot":
             arrived["odometry"] = self.odometry.arrived
@@ -308,7 +308,7 @@ class Inputs:
         return self.repeating(now) or " and ".join(f"no {name} for {seconds:.0f} s" for name, seconds in silent.items())
 
     def repeating(self, now: float) -> str:
-        """Return the inputs whose stamps stand for ``max_outage`` though messages come; empty for none."""
+        """Return the inputs whose stamps have not advanced for ``max_outage`` while messages come; empty if none."""
         stands = {name: newest.stands(now, self.config.max_outage) for name, newest in self._newest.items()}
         return " and ".join(f"{name} {_COMES[name]} {text}" for name, text in stands.items() if text)
 
@@ -318,12 +318,12 @@ class Inputs:
 
 
 class LidarInputs(Inputs):
-    """Inputs of a robot that sends only clouds: each goes through lidar odometry before it is paired with it.
+    """Inputs of a robot that sends only clouds: lidar odometry processes each cloud, and is then paired with it.
 
-    Frames go to the odometry engine in the order of their stamps; one is under way, and at most two wait. An
-    :class:`OdometryBuffer` classifies the stamps: the same strays, pauses and restarted clocks, without a motion.
-    Whenever lidar odometry restarts, the search does too, for the drive in between is not known. ``epoch`` is a number
-    that no job of this robot has had before.
+    Frames go to the odometry engine in order of their stamps; one is under way, and at most two wait. An
+    :class:`OdometryBuffer` classifies the stamps (strays, pauses, restarted clocks), without a motion. Whenever lidar
+    odometry restarts, so does the search, as the motion in between is unknown. No earlier job of this robot has had
+    the id ``epoch``.
     """
 
     odometry_source = "kiss-icp"
@@ -361,11 +361,11 @@ class LidarInputs(Inputs):
 
     @property
     def has_job(self) -> bool:
-        """Whether a frame waits for the odometry engine, without the lock."""
+        """Whether a frame waits for the odometry engine; read without the lock."""
         return self._under_way is None and len(self._waiting) > 0
 
     def take_job(self) -> OdometryJob | None:
-        """Hand the oldest frame to the odometry engine; None while one is under way."""
+        """Hand the oldest frame to the odometry engine; None without one, or while one is under way."""
         if not self.has_job:
             return None
         self._under_way = self._waiting.popleft()
@@ -374,7 +374,7 @@ class LidarInputs(Inputs):
         return OdometryJob(self.keys.robot, self._epoch, message.stamp_ns, message.points, times, self.lidar)
 
     def job_done(self, job: OdometryJob, result: OdometryResult, now: float) -> Iterator[Break]:
-        """Add the odometry of a frame, and the frame; each break has to be applied before the iteration goes on.
+        """Add a frame's odometry, then the frame; the caller applies each break before it continues the iteration.
 
         Jobs from before a reset are ignored.
         """
@@ -405,13 +405,13 @@ class LidarInputs(Inputs):
         return self.restart_odometry("lidar odometry failed on a frame")
 
     def restart_odometry(self, reason: str) -> Break:
-        """Begin the lidar odometry again."""
+        """Restart the lidar odometry."""
         self._epoch += 1
         self.odometry.clear()
         return Break(reason)
 
     def silence_reason(self, now: float) -> str:
-        """As of :class:`Inputs`."""
+        """As in :class:`Inputs`."""
         timeout = self.config.odometry_timeout
         if now - self._newest["clouds"].came_at > timeout:
             return f"no clouds for {timeout:g} s"

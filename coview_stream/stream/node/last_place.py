@@ -1,6 +1,6 @@
-"""Last place of a robot: its file, its message to another node, and guesses of people.
+"""Last place of a robot: its file, its message to another node, and guesses by people.
 
-Every such place is a hypothesis: the engine verifies it like any other
+Each is a hypothesis, which the engine verifies like any other
 (:meth:`coview_stream.localization.localizer.Localizer.hint_pose`).
 """
 
@@ -36,31 +36,31 @@ log = logging.getLogger(__name__)
 VERSION = 1
 
 _FORMAT = "coview_stream last pose"
-_MAX_BYTES = 65_536  # of a file; ours have 500
-_MAX_NAME = 60  # characters of a robot's name in that of its file
+_MAX_BYTES = 65_536  # of a file; ours have about 500
+_MAX_NAME = 60  # characters of a robot's name in its file's name
 _MAX_GUESS_BYTES = 4096
-_SIGMAS = 2.0  # of a covariance that are tried around its pose
+_SIGMAS = 2.0  # of a pose's covariance: range tried around it
 _GUESS_FIELDS = ("x", "y", "yaw", "distance", "angle", "map", "within")
 
 
 @dataclass(frozen=True, eq=False)
 class LastPlace:
-    """Place of a robot on a map. A file has its ``T_map_body``; a message between nodes its ``T_map_odom``."""
+    """A robot's place on a map. Files hold its ``T_map_body``, messages between nodes its ``T_map_odom``."""
 
-    map_sha256: str  # of the base map, 64 hexadecimal digits; of a site that of its state
+    map_sha256: str  # of the base map, 64 hexadecimal digits; for a site of its state
     stamp_ns: int | None = None  # sensor time of ``T_map_body``, nanoseconds
     T_map_body: Pose | None = None  # (4, 4) float64 in the frame of the map's sources, metres
-    T_map_odom: Pose | None = None  # (4, 4) map <- odometry; the robot's odometry goes on when its node changes
-    calibration: Calibration | None = None  # of its sensor and odometry; None if not known
+    T_map_odom: Pose | None = None  # (4, 4) map <- odometry; odometry continues when another node takes over
+    calibration: Calibration | None = None  # of sensor and odometry; None if unknown
 
     def to_message(self) -> dict[str, Any]:
-        """Return the plain data of a message to another node."""
+        """Return the plain data for a message to another node."""
         plain: dict[str, Any] = {"map_sha256": self.map_sha256, "T_map_odom": np.asarray(self.T_map_odom).tolist()}
         return plain if self.calibration is None else plain | {"calibration": asdict(self.calibration)}
 
     @classmethod
     def from_message(cls, plain: Any) -> LastPlace:
-        """Read :meth:`to_message`, from anyone; ValueError, TypeError or KeyError for something else."""
+        """Read :meth:`to_message`, from anyone; ValueError, TypeError or KeyError if it is something else."""
         return cls(
             map_sha256=str(plain["map_sha256"])[:64],
             T_map_odom=read_pose(plain, "T_map_odom"),
@@ -72,10 +72,10 @@ class LastPlace:
 
 
 def save(folder: Path, robot: str, place: LastPlace) -> Path:
-    """Write a robot's place and return the file; OSError if the directory cannot be made or written.
+    """Write a robot's place and return the file; OSError if the directory cannot be created or written.
 
-    Only the owner may read the file. A robot's day usually ends with a power cut: the bytes are on the disk before the
-    file gets its name.
+    Only the owner may read the file. A robot's day usually ends with a power cut, so the bytes are on the disk before
+    the file gets its name.
     """
     path = file_of(folder, robot, place.map_sha256)
     document = {
@@ -89,15 +89,15 @@ def save(folder: Path, robot: str, place: LastPlace) -> Path:
     if place.calibration is not None:
         document["calibration"] = asdict(place.calibration)  # radians and metres
     _make(folder)
-    with atomic_file(path, sync=True, private=True) as file:  # a link in its place is replaced, not followed
+    with atomic_file(path, sync=True, private=True) as file:  # replaces a link instead of following it
         file.write(json.dumps(document, indent=1).encode())
     return path
 
 
 def load(folder: Path, robot: str, map_sha256: str) -> LastPlace | None:
-    """Read the file of a robot on a map; None if there is none.
+    """Read a robot's file for a map; None if there is none.
 
-    None as well, after a warning that names the file, for one that is damaged, of another version, robot or map.
+    Also None, after a warning that names the file, if it is damaged or of another version, robot or map.
     """
     path = file_of(folder, robot, map_sha256)
     try:
@@ -124,12 +124,12 @@ def load(folder: Path, robot: str, map_sha256: str) -> LastPlace | None:
 
 
 def forget(folder: Path, robot: str, map_sha256: str) -> None:
-    """Delete the file of a robot on a map, if there is one; OSError if that cannot be done."""
+    """Delete a robot's file for a map, if there is one; OSError if that fails."""
     file_of(folder, robot, map_sha256).unlink(missing_ok=True)
 
 
 def file_of(folder: Path, robot: str, map_sha256: str) -> Path:
-    """Return the file of a robot on a map: the robot's name, safe for every file system, and 16 digits."""
+    """Return a robot's file for a map: the robot's name, safe for every file system, and 16 digits of the hash."""
     name = quote(robot, safe="")
     if name != robot.lower() or len(name) > _MAX_NAME:  # 'R1' and 'r1' are one file on some systems
         name = f"{name[:_MAX_NAME]}-{hashlib.sha256(robot.encode()).hexdigest()[:8]}"
@@ -137,16 +137,16 @@ def file_of(folder: Path, robot: str, map_sha256: str) -> Path:
 
 
 def try_out(folder: Path) -> None:
-    """Make a directory if it is not there, write a file into it and delete that; OSError where that fails."""
+    """Create a directory if it is missing, write a file into it and delete the file; OSError if that fails."""
     _make(folder)
     with tempfile.NamedTemporaryFile(dir=folder, prefix=".try-") as file:
         file.write(b"x")
 
 
 def default_folder() -> Path:
-    """Return this user's directory for the state of programs between runs; ConfigError without a home directory."""
+    """Return this user's directory for program state between runs; ConfigError without a home directory."""
     folder = Path(os.environ.get("XDG_STATE_HOME", ""))
-    if not folder.is_absolute():  # the specification says that a relative one is to be ignored
+    if not folder.is_absolute():  # the specification says to ignore a relative one
         try:
             folder = Path.home() / ".local/state"
         except RuntimeError as error:
@@ -157,12 +157,12 @@ def default_folder() -> Path:
 
 
 def _make(folder: Path) -> None:
-    """Make a directory that only its owner may enter; an existing one keeps its mode."""
+    """Create a directory that only its owner may enter; an existing one keeps its mode."""
     folder.mkdir(mode=0o700, parents=True, exist_ok=True)
 
 
 def _open_regular(path: Path) -> BinaryIO:
-    """Open a file to read; OSError for a link, and for a pipe or device, which could block."""
+    """Open a file for reading; OSError for a link, and for a pipe or device, which could block."""
     flags = os.O_RDONLY | getattr(os, "O_NOFOLLOW", 0) | getattr(os, "O_NONBLOCK", 0) | getattr(os, "O_BINARY", 0)
     file = os.fdopen(os.open(path, flags), "rb")
     if not stat.S_ISREG(os.fstat(file.fileno()).st_mode):
@@ -171,15 +171,14 @@ def _open_regular(path: Path) -> BinaryIO:
     return file
 
 
-# ---- guesses of people: parameters of a query, JSON, or RViz' pose
+# ---- guesses by people: parameters of a query, JSON, or RViz's pose
 
 
 def guess_of_fields(given: Mapping[str, Any]) -> PlaceGuess:
-    """Return the guess of named numbers or their texts: x and y, perhaps yaw, distance and angle (radians, metres).
+    """Return the guess in named numbers or their texts: x and y, perhaps yaw, distance and angle (radians, metres).
 
-    With ``map``, a name, they are in the frame of that one of several maps, or ``map``, that of a single one;
-    ``within``: as of a :class:`PlaceGuess`.
-    InputError if x or y is missing, a name is unknown, or a value is no number or out of its range.
+    ``map`` names the map whose frame they are in; a single map is ``map``. ``within``: as in :class:`PlaceGuess`.
+    InputError if x or y is missing, a name is unknown, or a value is not a number or out of range.
     """
     unknown = sorted(set(given) - set(_GUESS_FIELDS))
     if unknown or "x" not in given or "y" not in given:

@@ -1,4 +1,4 @@
-"""Keeper of the robots' last places: files, written by a thread of its own, for a disk may hang."""
+"""Keeper of the robots' last places: files, written on its own thread, as a disk may hang."""
 
 from __future__ import annotations
 
@@ -16,8 +16,8 @@ from coview_stream.stream.transport.error_guard import RateLimitedErrors
 
 log = logging.getLogger("coview_stream.node")
 
-_INTERVAL = 5.0  # seconds between two rounds
-_MIN_MOVE = 0.1  # metres: a robot that stands still must not wear its card out
+_INTERVAL = 5.0  # seconds between rounds
+_MIN_MOVE = 0.1  # metres: a standing robot must not wear out its memory card
 _MIN_TURN = float(np.radians(1.0))
 
 
@@ -34,7 +34,7 @@ class LastPlaceKeeper:
         self._failing = False
 
     def run(self, stopping: threading.Event) -> None:
-        """Hint, then write until ``stopping`` is set, and once more."""
+        """Offer the last places, write until ``stopping`` is set, and once more."""
         self.hint()
         while not stopping.wait(self._interval):
             self.keep()
@@ -52,7 +52,7 @@ class LastPlaceKeeper:
                     session.offer(last)
 
     def keep(self) -> None:
-        """Write the place of each robot that is TRACKING; delete the files that a client has asked to forget."""
+        """Write the place of each robot that is TRACKING; delete files that a client has asked to forget."""
         for session in self._sessions:
             with self._errors.catch(f"{session.keys.robot}: its last pose"):
                 self._keep(session)

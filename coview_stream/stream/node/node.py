@@ -1,4 +1,4 @@
-"""The node: threads and clocks between the sessions of the robots and the engines, and the change of its map.
+"""The node: threads and clocks between the robots' sessions and the engines, and changes of its map.
 
 The transport's threads decode and queue; one thread feeds each engine and waits for it; the pose clock and the status
 clock wait for neither.
@@ -33,29 +33,29 @@ log = logging.getLogger("coview_stream.node")
 _MAX_POSE_TICKS = 200.0  # of the pose clock, per second
 _CLOSE_TIMEOUT = 1.5  # seconds for everything to end; ``serve`` promises two
 _JOIN_TIMEOUT = 0.3  # of these, for the threads to finish their work
-_MAX_HANDOVER = 60.0  # seconds that a robot keeps the old map while the new one has not verified its place
-_AGAIN = 0.5  # seconds from an exception of a service to its next begin
+_MAX_HANDOVER = 60.0  # seconds that a robot keeps the old map until the new one has verified its place
+_AGAIN = 0.5  # seconds from a service's exception to its restart
 _MAX_FAULT = 200  # characters
-_STEP = 0.02  # seconds between two looks at a change of the map
-_RELOADS_APART = 1.0  # seconds from the begin of a change to that of the next, however often it is asked for
-_LINES_APART = 60.0  # seconds between two equal lines about changes
+_STEP = 0.02  # seconds between checks of a map change
+_RELOADS_APART = 1.0  # seconds between the starts of two map changes, however often requested
+_LINES_APART = 60.0  # seconds between equal log lines about changes
 
 Service = Callable[[threading.Event], None]
-"""Work on a thread of its own, until the event is set."""
+"""Work on its own thread until the event is set."""
 
 
 class OpenedMap(NamedTuple):
     """A map with engines that are ready for jobs."""
 
     sha256: str  # of the map
-    # by name: ``track``, ``search`` and, for robots that send no odometry, ``odometry``
+    # by name: ``track``, ``search`` and ``odometry``, which serves robots that send none
     engines: Mapping[str, EngineProcess]
-    sessions: Sequence[Session]  # one per robot, in the node's order, without any message
-    file: Path | None = None  # that it was opened from; None where it is not needed
+    sessions: Sequence[Session]  # one per robot, in the node's order, new
+    file: Path | None = None  # file it was opened from; None where it is not needed
 
 
 OpenMap = Callable[[str, Callable[[], bool]], OpenedMap | None]
-"""Opens the map's file again, unless its hash is the one given; the function returns True to give up."""
+"""Opens the map file again, unless its hash is the given one; the function returns True to give up."""
 
 
 class Node:
@@ -63,14 +63,14 @@ class Node:
 
     Args:
         opened: the map.
-        transport: where messages come from and go to; the node closes it.
+        transport: source and destination of messages; the node closes it.
         config: rates and limits.
-        pose_format: codec of the poses; None leaves it to each robot's keys.
-        geo: publishes poses as places on Earth as well; None: does not.
-        shared: a fleet says which robots this node serves; else it serves them all.
-        open_map: opens the map again, at a reload; None if there is no way to.
+        pose_format: codec of the poses; None: each robot's keys decide.
+        geo: also publishes poses as places on Earth; None: does not.
+        shared: a fleet decides which robots this node serves; else it serves all.
+        open_map: opens the map again, for a reload; None: the map cannot change.
         on_reload: called with True when a change of the map begins, with False when it is over.
-        map_files: file of the map by its hash; the node adds those of later maps.
+        map_files: map file by hash; the node adds those of later maps.
     """
 
     def __init__(
@@ -95,10 +95,10 @@ class Node:
         self._errors = RateLimitedErrors(log)
         self._stopping = threading.Event()
         self._threads: list[threading.Thread] = []
-        self.faults: dict[str, str] = {}  # newest exception of each service that was begun again after one
+        self.faults: dict[str, str] = {}  # newest exception of each service that was restarted after one
         self._ending: threading.Thread | None = None
         self.reporter = Reporter(self.sessions, transport, self._errors, self.identity)
-        # of the map, and of one that is to follow it
+        # for the map, and for one that will replace it
         self.feeds: tuple[EngineFeed[Session], ...] = (self._make_feed(opened),)
         self.endpoints = {
             session.keys.robot: RobotEndpoints(session, transport, self.reporter, self._wake, pose_format, geo)
@@ -106,10 +106,10 @@ class Node:
         }
         self._robots = list(self.endpoints.values())
         self.reloader = None if open_map is None else MapReloader(self, open_map, on_reload)
-        self.started = self.beat = time.monotonic()  # local time of the start, and of the pose clock's newest tick
+        self.started = self.beat = time.monotonic()  # local times of the start and of the pose clock's newest tick
 
     def start(self, services: Mapping[str, Service] | None = None) -> None:
-        """Declare everything and start the threads, those of ``services`` by name as well."""
+        """Declare everything and start the threads, including those of ``services``, by name."""
         self.declare()
         for feed in self.feeds:
             feed.start()
@@ -120,10 +120,10 @@ class Node:
         for name, run in running.items():
             thread = threading.Thread(target=self._keep_running, name=f"coview-{name}", args=(name, run), daemon=True)
             thread.start()
-            self._threads.append(thread)  # now, for one that has not started counts as one that has ended
+            self._threads.append(thread)  # after its start: until then it would count as ended
 
     def _keep_running(self, name: str, run: Service) -> None:
-        """Run a service, again after any exception: it is logged, shown in :attr:`faults`, and ends no thread."""
+        """Run a service, and restart it after any exception: it is logged and shown in :attr:`faults`."""
         while not self._stopping.is_set():
             with self._errors.catch(name) as caught:
                 run(self._stopping)
@@ -145,10 +145,10 @@ class Node:
             self.transport.announce(robot.session.keys.alive)
 
     def close(self, timeout: float = _CLOSE_TIMEOUT) -> bool:
-        """Publish a last status, undeclare, end the engines; later calls only wait.
+        """Publish a last status, undeclare and end the engines; later calls only wait.
 
         Returns:
-            Whether all is done; False after ``timeout`` seconds if the network holds up the thread that does it.
+            Whether all is done; False after ``timeout`` seconds if the network blocks the thread that does it.
         """
         if not self._stopping.is_set():
             self._stopping.set()
@@ -172,7 +172,7 @@ class Node:
 
     @property
     def ended_threads(self) -> list[str]:
-        """Names of its threads that have ended, though it has not."""
+        """Names of the threads that have ended while the node has not."""
         threads = [*self._threads, *(thread for feed in self.feeds for thread in feed.threads)]
         return [t.name for t in threads if not (t.is_alive() or self._stopping.is_set())]
 
@@ -180,7 +180,7 @@ class Node:
         def note_change(session: Session | None) -> None:
             if session is None:
                 self.reporter.changed.set()
-            elif session in self.sessions:  # else it is of a map that is not in force yet
+            elif session in self.sessions:  # else it is on a map not yet in force
                 self.reporter.report_change(session)
 
         return EngineFeed(opened.sessions, opened.engines, self._errors, note_change)
@@ -190,8 +190,8 @@ class Node:
             feed.wake_for(session)
 
     def _run_pose_clock(self, stopping: threading.Event) -> None:
-        # robots are served one after the other over the period: poses of many at once are more than the queues of
-        # zenoh and of a router hold for urgent messages, and those that came last would be dropped
+        # robots take turns over the period: the poses of many at once exceed the queues of zenoh and routers for urgent
+        # messages, and the last of them would be dropped
         rate = self.config.pose_rate
         groups = max(1, min(len(self._robots), int(_MAX_POSE_TICKS / rate)))
         clock = Rate(rate * groups, time.monotonic(), slack=0.5 / rate)
@@ -203,7 +203,7 @@ class Node:
                 group = (group + 1) % groups
 
     def publish_poses(self, now: float, robots: Sequence[RobotEndpoints] | None = None) -> None:
-        """Let time pass in every session, or in some, and publish the poses that are known."""
+        """Advance time in every session, or in some, and publish the poses that are known."""
         for robot in self._robots if robots is None else robots:
             with self._errors.catch(robot.session.keys.robot):
                 robot.publish_pose(now)
@@ -212,18 +212,18 @@ class Node:
 
     @property
     def map_sha256(self) -> str:
-        """Hash of the map that is served; during a change of the map, of the one before."""
+        """Hash of the served map; during a change of the map, of the old one."""
         return self.feeds[0].robots[0].map_sha256
 
     def reload(self) -> dict[str, Any]:
-        """Ask for the map's file to be opened again; ``ok`` is False where this node cannot."""
+        """Request a reload of the map file; ``ok`` is False if this node cannot."""
         if self.reloader is None:
             return {"ok": False, "error": "this node was not made with a way to open a map"}
         return self.reloader.request()
 
     def add_map(self, opened: OpenedMap) -> None:
-        """Hand the robots' messages to the sessions and engines of another map as well, which publish nothing."""
-        for feed in self.feeds[1:]:  # of a change that failed half way
+        """Hand the robots' messages also to the sessions and engines of another map, which publish nothing."""
+        for feed in self.feeds[1:]:  # left by a change that failed half-way
             feed.close(_JOIN_TIMEOUT)
         added = self._make_feed(opened)
         self.feeds = (self.feeds[0], added)
@@ -232,24 +232,24 @@ class Node:
         added.start()
 
     def switch_robot(self, number: int) -> None:
-        """Publish from now on the poses of the ``number``-th robot on the other map."""
+        """From now on publish the ``number``-th robot's poses on the other map."""
         robot = self._robots[number]
         robot.switch_session()
         self.sessions[number] = robot.session
         self.reporter.changed.set()
 
     def drop_map(self) -> None:
-        """End the engines of the first map, when all robots are on the other one."""
+        """End the engines of the first map, once all robots are on the other."""
         old, self.feeds = self.feeds[0], self.feeds[1:]
         old.close(_JOIN_TIMEOUT)
 
 
 class MapReloader:
-    """Changes the map of a running node when asked to, one change at a time, on a thread of its own.
+    """Changes the map of a running node on request, one change at a time, on its own thread.
 
-    Each robot keeps the old map, and its poses, until the new one has verified its place: both get all messages
-    meanwhile, and the place on the old map is a hypothesis on the new one. A robot without a place changes at once, one
-    that is not found on the new map after a minute changes without a place, and is searched for.
+    Each robot keeps the old map and its poses until the new map has verified its place: meanwhile both get all
+    messages, and the place on the old map is a hypothesis on the new one. A robot without a place changes at once. One
+    that is not found on the new map within a minute changes without a place, and is searched for.
 
     Attributes:
         last: outcome of the newest change: ``result`` (``none``, ``loading``, ``handing over``, ``changed``,
@@ -262,22 +262,22 @@ class MapReloader:
         self._on_change = on_change
         self._asked = threading.Event()
         self._busy = False
-        self._said: dict[int, tuple[str, float]] = {}  # by level: the newest line, and its local time
+        self._said: dict[int, tuple[str, float]] = {}  # by level: the newest line and its local time
         self.max_handover = _MAX_HANDOVER
         self.last: dict[str, Any] = {"result": "none", "map_sha256": node.map_sha256, "error": None}
 
     @property
     def outcome(self) -> str:
-        """Result of the newest change that was asked for: as of :attr:`last`, ``loading`` until it is over."""
+        """Result of the newest requested change, as in :attr:`last`; ``loading`` until it is over."""
         return "loading" if self._busy or self._asked.is_set() else str(self.last["result"])
 
     def request(self) -> dict[str, Any]:
-        """Ask for a change; return the newest outcome. Asked for during a change, another one follows."""
+        """Request a change; return the newest outcome. A request during a change makes another one follow."""
         self._asked.set()
         return {"ok": True, "busy": self._busy, "last": dict(self.last)}
 
     def run(self, stopping: threading.Event) -> None:
-        """Change the map whenever that is asked for, until ``stopping`` is set."""
+        """Change the map on each request, until ``stopping`` is set."""
         while not stopping.is_set():
             if not self._asked.wait(0.1):
                 continue
@@ -287,7 +287,7 @@ class MapReloader:
             self._on_change(True)
             try:
                 self._change(stopping)
-            except Exception as error:  # the next one is to be answered all the same
+            except Exception as error:  # later requests must still be answered
                 self._note("failed", repr(error))
                 log.exception("the change of the map failed")
             finally:
@@ -347,7 +347,7 @@ class MapReloader:
                     self._node.switch_robot(number)
                     del waiting[number]
         if waiting:
-            return  # the node ends, and all engines with it
+            return  # the node ends, with all engines
         self._node.drop_map()
         self._note("changed")
         log.info("map %s is in force after %.1f s", opened.sha256[:16], time.monotonic() - begin)

@@ -1,4 +1,4 @@
-"""Endpoints of one robot on the network, and their answers: poses, places on Earth, statuses, the view of the map."""
+"""Endpoints of one robot on the network: poses, places on Earth, statuses and answers, such as the map view."""
 
 from __future__ import annotations
 
@@ -33,16 +33,16 @@ _ROS_NODE = "coview_stream"
 class RobotEndpoints:
     """One robot's subscriptions, queryables, publishers and liveliness tokens, around its session.
 
-    ``wake_engines`` is called with the session when there may be a job. ``pose_format`` is the codec of the poses; None
-    leaves it to the robot's keys. ``geo`` publishes poses as places on Earth as well.
+    ``wake_engines`` is called with the session when there may be a job. ``pose_format`` is the codec of the poses;
+    None: the robot's keys decide. ``geo`` also publishes poses as places on Earth.
     """
 
     def __init__(
         self, session: Session, transport: Transport, reporter: Reporter, wake_engines: Callable[[Session], None],
         pose_format: str | None = None, geo: GeoOutput | None = None,
     ) -> None:  # fmt: skip
-        self._sessions: tuple[Session, ...] = (session,)  # that in force, and perhaps one on another map
-        self._switching = threading.Lock()  # no pose of the session before is published after the switch
+        self._sessions: tuple[Session, ...] = (session,)  # the session in force, perhaps one on another map
+        self._switching = threading.Lock()  # no pose of the old session is published after the switch
         self._transport = transport
         self._reporter = reporter
         self._wake_engines = wake_engines
@@ -51,7 +51,7 @@ class RobotEndpoints:
         self._geo = geo
         self._publisher: Publisher | None = None
         self._locations: Publisher | None = None
-        self._endings: list[Callable[[], None]] = []  # of subscriptions and answers
+        self._endings: list[Callable[[], None]] = []  # ends of subscriptions and answers
 
     @property
     def session(self) -> Session:
@@ -59,18 +59,18 @@ class RobotEndpoints:
         return self._sessions[0]
 
     def add_session(self, session: Session) -> None:
-        """Hand all messages to another session as well, of another map."""
+        """Hand all messages also to a session on another map."""
         self._sessions = (self._sessions[0], session)
 
     def switch_session(self) -> None:
-        """Go over to that session, with the counters and the newest pose of the one in force."""
+        """Switch to that session, with the counters and newest pose of the one in force."""
         with self._switching:
             old, new = self._sessions
             new.continue_from(old)
             self._sessions = (new,)
 
     def declare(self, node_id: str, number: int) -> None:
-        """Declare the outputs; ``node_id`` is of our ROS node, ``number`` of this robot there, from 1."""
+        """Declare the outputs of this robot, the ``number``-th, from 1, of our ROS node ``node_id``."""
         keys, transport = self.session.keys, self._transport
         self._publisher = transport.publisher(keys.pose, "realtime")
         if keys.rmw:
@@ -89,7 +89,7 @@ class RobotEndpoints:
         return bool(self._endings)
 
     def begin_serving(self) -> None:
-        """Read the robot's messages and answer its queries from now on."""
+        """Start to read the robot's messages and answer its queries."""
         keys, transport = self.session.keys, self._transport
         if self.session.inputs.odometry_source == "robot":
             self._endings.append(transport.subscribe(keys.odometry, self.on_odometry, "all"))
@@ -103,26 +103,26 @@ class RobotEndpoints:
         self._reporter.served.add(keys.robot)
 
     def end_serving(self) -> None:
-        """Read no messages, answer no queries: another node does, and a client takes the first reply."""
+        """Stop reading messages and answering queries: another node does, and a client takes the first reply."""
         self._reporter.served.discard(self.session.keys.robot)
         endings, self._endings = self._endings, []
         for end in endings:
             end()
 
     def on_cloud(self, sample: Sample) -> None:
-        """Take in a cloud."""
+        """Handle a cloud."""
         for session in self._sessions:
             session.on_cloud(sample, time.monotonic())
             self._wake_engines(session)
 
     def on_odometry(self, sample: Sample) -> None:
-        """Take in an odometry sample."""
+        """Handle an odometry sample."""
         for session in self._sessions:
             session.on_odometry(sample, time.monotonic())
             self._wake_engines(session)
 
     def on_initial_pose(self, sample: Sample) -> None:
-        """Take in a guess of the place."""
+        """Handle a guess of the place."""
         try:
             guess = decode_guess(sample)
             for session in self._sessions:
@@ -143,7 +143,7 @@ class RobotEndpoints:
         return self._answer()
 
     def suggest(self, parameters: dict[str, str]) -> dict[str, Any]:
-        """Answer ``rpc/suggest``; InputError, which is replied, where it names no place."""
+        """Answer ``rpc/suggest``; an InputError, sent as the reply, if the guess names no place."""
         guess, notes = guess_of_fields(parameters), []
         for session in self._sessions:
             try:
@@ -159,7 +159,7 @@ class RobotEndpoints:
         return {"ok": True, "robot": self.session.keys.robot, "state": state.reported, "reason": reason}
 
     def publish_pose(self, now: float) -> None:
-        """Let time pass in the session, and publish the pose if it is known."""
+        """Advance time in the session, and publish the pose if it is known."""
         if not self.serving:
             return
         with self._switching:
@@ -176,12 +176,12 @@ class RobotEndpoints:
 
 
 class GeoOutput:
-    """Publication of poses as places on Earth, by the reference system of the map in force, which may change.
+    """Publication of poses as places on Earth, in the reference system of the map in force, which may change.
 
-    ``files`` are those of the node's maps by their hashes, ``sha256`` is of the map to begin with.
+    ``files`` are the node's map files by hash, ``sha256`` is the hash of the first map.
 
     Raises:
-        InputError, DependencyError: as of :class:`GeoReference`.
+        InputError, DependencyError: as :class:`GeoReference`.
     """
 
     def __init__(self, files: Mapping[str, Path], sha256: str, encoding: str) -> None:
@@ -192,7 +192,7 @@ class GeoOutput:
         self._sha256, self._references = loaded.sha256, _references(loaded)
 
     def publish(self, pose: PoseMessage, publisher: Publisher) -> None:
-        """Publish a pose, where the map has a reference and the pose a place on Earth."""
+        """Publish a pose if the map has a reference and the pose a place on Earth."""
         geo, position = self.reference(pose.map_sha256, pose.frame_id), pose.T_map_body[:3, 3]
         if geo is None:
             return
@@ -212,7 +212,7 @@ class GeoOutput:
         publisher.put(encode_location(message, self._encoding))
 
     def reference(self, sha256: str, name: str = "") -> GeoReference | None:
-        """Return the reference of a map by its hash, and of several maps by the name of the one; None for none."""
+        """Return the reference of a map by its hash, and of several maps by name; None without one."""
         with self._lock:
             if sha256 != self._sha256:
                 try:
@@ -221,13 +221,13 @@ class GeoOutput:
                 except (CoViewError, KeyError) as error:
                     log.warning("no latitude and longitude on the new map: %s", error)
                     self._sha256, self._references = sha256, {}
-            if sha256 != self._sha256:  # the file is of another map by now
+            if sha256 != self._sha256:  # the file now holds another map
                 return None
             return self._references.get(name, self._references.get(""))
 
 
 def _references(base_map: BaseMap) -> dict[str, GeoReference]:
-    """Return the references of a map's parts by name; of one map its own, without a name."""
+    """Return the references of a map's parts by name; for a single map its own, under an empty name."""
     parts = MapParts.of(base_map.parameters)
     if parts is None:
         return {"": GeoReference(base_map.crs)}
@@ -235,9 +235,9 @@ def _references(base_map: BaseMap) -> dict[str, GeoReference]:
 
 
 class MapViewAnswer:
-    """Answer to ``rpc/map_view``: :meth:`~coview_stream.basemap.summary.MapView.to_json` of the map that is served.
+    """Answer to ``rpc/map_view``: :meth:`~coview_stream.basemap.summary.MapView.to_json` of the served map.
 
-    ``files`` are those of the node's maps by their hashes, ``sha256`` returns the hash of the map that is served.
+    ``files`` are the node's map files by hash; ``sha256`` returns the hash of the served map.
     """
 
     def __init__(self, files: Mapping[str, Path], sha256: Callable[[], str]) -> None:
@@ -246,7 +246,7 @@ class MapViewAnswer:
         self._made: tuple[str, dict[str, Any]] | None = None
 
     def __call__(self, parameters: dict[str, str]) -> dict[str, Any]:
-        """Return the view, which is made once for each map; MapError if its file is of another map by now."""
+        """Return the view, built once per map; MapError if its file now holds another map."""
         served = self._sha256()
         if self._made is None or self._made[0] != served:
             self._made = served, MapView.of(load_served(self._files, served), POINTS_ON_WIRE).to_json()

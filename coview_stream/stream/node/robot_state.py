@@ -1,4 +1,4 @@
-"""State of one robot as its node publishes it: the engine's state, and the vetoes of the session."""
+"""State of one robot as its node publishes it: the engine's state with the session's vetoes."""
 
 from __future__ import annotations
 
@@ -16,39 +16,39 @@ from coview_stream.stream.node.counters import Counters
 from coview_stream.stream.node.engine_queue import PlaceHints, QueuedFrame
 
 _NS = 1_000_000_000
-_MAX_TRANSITIONS = 5  # that a status shows: one a second would not show them all
+_MAX_TRANSITIONS = 5  # in a status: a status a second with only the newest change would miss some
 
 
 class RobotState:
-    """State and odometry correction of one robot, from one reset of its session to the next; the session locks it."""
+    """State and odometry correction of one robot between two resets of its session, which locks it."""
 
     def __init__(self, robot: str, map_sha256: str, counters: Counters, hints: PlaceHints) -> None:
-        """Begin in SEARCHING; ``hints`` outlive resets."""
+        """Start in SEARCHING; ``hints`` outlive resets."""
         self.robot = robot
         self.map_sha256 = map_sha256
         self.last_frame_ns: int | None = None  # stamp of the newest processed frame
-        self.calibration: Calibration | None = None  # of sensor and odometry at the newest frame, in every state
+        self.calibration: Calibration | None = None  # of sensor and odometry at the newest frame, in any state
         self._hints = hints
         self._counters = counters
-        self._lost = False  # and no fix has restored the place yet
+        self._lost = False  # no fix has restored the place since
         self._loss_reason = ""
         self._restart_reason = ""
         self._forget_epoch()
 
     def _forget_epoch(self) -> None:
-        """Forget all that refers to the odometry frame, which has ended."""
+        """Forget everything that refers to the odometry frame, which has ended."""
         self._hints.begin_epoch()
         self._fix: Fix | None = None
         self._correction: OdomCorrection | None = None
-        self._verify_from_ns: int | None = None  # frames from this stamp on may verify the place
+        self._verify_from_ns: int | None = None  # frames stamped from here on may verify the place
         self._published: PoseMessage | None = None
 
     @property
     def state(self) -> State:
-        """The engine's state, but for a lost place and a pause of odometry; there is a pose while it is TRACKING.
+        """The engine's state, except for a lost place and a pause of odometry; there is a pose while it is TRACKING.
 
-        A place is lost while odometry or usable frames stay away, and with every new odometry epoch. Only a fix in
-        TRACKING ends that: after silence a verified frame suffices, in a new epoch the place is searched for.
+        A place is lost when odometry or usable frames stop, and with every new odometry epoch. Only a fix in TRACKING
+        ends the loss: after silence a verified frame suffices, in a new epoch the place is searched for.
         """
         if self._lost:
             return State.LOST
@@ -57,28 +57,28 @@ class RobotState:
 
     @property
     def evidence(self) -> KeyframeEvidence | None:
-        """Evidence of the newest keyframe, if there is any in this odometry epoch."""
+        """Evidence of the newest keyframe; None without one in this odometry epoch."""
         return None if self._fix is None else self._fix.evidence
 
     @property
     def engine_has_place(self) -> bool:
-        """Whether the engine holds a place, even if there is no pose because it has to be verified."""
+        """Whether the engine has a place, even if there is no pose until it is verified."""
         return self._fix is not None and self._fix.state.has_place
 
     @property
     def requires_verification(self) -> bool:
-        """Whether a frame has to verify the place before there is a pose again."""
+        """Whether a frame must verify the place before poses return."""
         return self._verify_from_ns is not None
 
     # ---- events
 
     def add_fix(self, fix: Fix, frame: QueuedFrame, events: Sequence[Event]) -> None:
-        """Apply the fix after a frame; the engine's ``events`` up to it say how often the place was lost."""
+        """Apply the fix at a frame; the engine's ``events`` up to it show how often the place was lost."""
         stamp_ns = self.last_frame_ns = frame.job.stamp_ns
         before, engine_before = self.state, None if self._fix is None else self._fix.state
         reason = fix.evidence.reason if fix.evidence else "evidence gone"
         if Event.PLACE_GIVEN_UP in events and engine_before is not State.LOST:
-            self._lose(reason)  # else a place accepted with this same frame was given up: no second loss
+            self._lose(reason)  # else a place accepted at this same frame was given up: no second loss
         self._fix = fix
         self._lost |= fix.state is State.LOST
         self.calibration = fix.calibration or self.calibration
@@ -93,7 +93,7 @@ class RobotState:
             self._hints.verified(fix.T_map_body, self.calibration)
 
     def restart_search(self, reason: str) -> None:
-        """Forget the place: there is another odometry frame."""
+        """Forget the place: the odometry frame has changed."""
         if self.engine_has_place:
             self._loss_reason = reason
         if self.state.has_place:
@@ -102,16 +102,16 @@ class RobotState:
         self._forget_epoch()
 
     def require_verification(self, from_ns: int) -> None:
-        """Give no pose until a frame stamped ``from_ns`` or later has verified the place."""
+        """Withhold poses until a frame stamped ``from_ns`` or later has verified the place."""
         self._verify_from_ns = from_ns if self._verify_from_ns is None else max(self._verify_from_ns, from_ns)
 
     def on_silence(self, reason: str, newest_ns: int) -> None:
-        """Lose the place until a frame from after the odometry of ``newest_ns`` has verified it."""
+        """Lose the place until a frame after the odometry of ``newest_ns`` has verified it."""
         self._lose(reason)
         self._verify_from_ns = newest_ns + 1
 
     def explain_loss(self, reason: str) -> None:
-        """Give a newer reason for a loss, if the place is lost: why it does not come back."""
+        """Replace the reason of a loss, if the place is lost, by why it does not come back."""
         if self.state is State.LOST:
             self._loss_reason = reason
 
@@ -123,9 +123,9 @@ class RobotState:
     # ---- published
 
     def reason(self, pending: str = "") -> str | None:
-        """Return one clause that gives the reason of the state; None before the first frame has been processed.
+        """Return the reason of the state in one clause; None before the first frame has been processed.
 
-        ``pending`` is the search that has not ended, which is the reason where none has.
+        ``pending`` describes an unfinished search; it is the reason if no search has ended.
         """
         evidence = self.evidence.reason if self.evidence else ""
         if self.state is State.TRACKING:
@@ -139,7 +139,7 @@ class RobotState:
         return evidence or self._restart_reason or pending or "too little has been seen"
 
     def searched(self) -> str:
-        """Return why a place that was lost is not found again; empty where nothing has been searched since."""
+        """Return why a lost place is not found; empty if there was no search since."""
         fix = self._fix
         if not self._lost or fix is None or fix.state.has_place or fix.evidence is None:
             return ""
@@ -147,22 +147,22 @@ class RobotState:
 
     @property
     def correction(self) -> OdomCorrection | None:
-        """Correction of odometry that is in force; None unless TRACKING."""
+        """The odometry correction in force; None unless TRACKING."""
         return self._correction if self.state is State.TRACKING else None
 
     def pose(self, odometry: OdometryBuffer) -> PoseMessage | None:
-        """Return the newest odometry, corrected, with its stamp, to be published; None unless TRACKING."""
+        """Return the newest odometry, corrected, with its stamp, for publication; None unless TRACKING."""
         pose, previous = self.newest_pose(odometry), self._published
         if pose is None or (previous is not None and pose.stamp_ns < previous.stamp_ns):
             return None
         if previous is not None and pose.stamp_ns == previous.stamp_ns:
-            pose = previous  # never publish two different poses for one stamp
+            pose = previous  # never two different poses for one stamp
         self._published = pose
         self._counters.poses += 1
         return pose
 
     def publish_after(self, other: RobotState) -> None:
-        """Publish nothing older than another state has, nor another pose for the same stamp."""
+        """Publish nothing older than another state has published, and no other pose for the same stamp."""
         self._published = other._published
 
     def newest_pose(self, odometry: OdometryBuffer) -> PoseMessage | None:
@@ -171,7 +171,7 @@ class RobotState:
         return None if correction is None else correction.pose(odometry, self.robot, self.map_sha256)
 
     def age(self, odometry: OdometryBuffer) -> float | None:
-        """Return seconds of sensor time from the newest registration to the newest odometry; None unless TRACKING."""
+        """Return sensor time, seconds, from the newest registration to the newest odometry; None unless TRACKING."""
         newest, correction = odometry.newest, self.correction
         return None if newest is None or correction is None else correction.age(newest.stamp_ns)
 
@@ -182,21 +182,21 @@ class RobotState:
 
 
 class OdomCorrection(NamedTuple):
-    """Correction of odometry by a fix: more than its pose, as odometry and its drift carry it on from here."""
+    """Correction of odometry by a fix, with what is needed to carry it on by odometry and its drift."""
 
     fix: Fix  # with a pose
-    stamp_ns: int  # of its frame
-    travelled: float  # metres that odometry had driven at the frame
-    turned: float  # radians that it had turned
+    stamp_ns: int  # of the fix's frame
+    travelled: float  # metres driven by odometry at the frame
+    turned: float  # radians turned by odometry at the frame
 
     def age(self, stamp_ns: int) -> float:
-        """Return seconds of sensor time from the newest registration that supported the fix to ``stamp_ns``."""
+        """Return sensor time, seconds, from the newest registration that supported the fix to ``stamp_ns``."""
         evidence = self.fix.evidence
         verified_ns = self.stamp_ns if evidence is None else min(self.stamp_ns, round(evidence.stamp * _NS))
         return max(0.0, (stamp_ns - verified_ns) / _NS)
 
     def pose(self, odometry: OdometryBuffer, robot: str, map_sha256: str) -> PoseMessage | None:
-        """Return the newest odometry, corrected, with its own stamp and its drift since; None before any."""
+        """Return the newest odometry, corrected, with its stamp and the drift since the fix; None without odometry."""
         newest = odometry.newest
         if newest is None:
             return None
@@ -221,7 +221,7 @@ class OdomCorrection(NamedTuple):
 class StateHistory:
     """The newest changes of a robot's reported state, with their reasons and evidence.
 
-    They are counted from 1 since the session began: a gap shows how many are missing.
+    They are numbered from 1 since the session began: a gap in the numbers shows missing ones.
     """
 
     def __init__(self) -> None:
@@ -231,9 +231,9 @@ class StateHistory:
         self._count = 0
 
     def add(self, state: State, reason: str, stamp_ns: int | None, evidence: KeyframeEvidence | None) -> bool:
-        """Record the state at the newest processed frame; return whether it is reported as another one.
+        """Record the state at the newest processed frame; return whether the reported state changed.
 
-        LOST for another reason counts as well, for that changes the search.
+        LOST for another reason is recorded too, because it changes the search.
         """
         lost_again = state is State.LOST and reason != self._reason
         changed = state.reported != self._state.reported
@@ -246,6 +246,6 @@ class StateHistory:
         return changed
 
     def to_json(self) -> list[dict[str, Any]]:
-        """Return the newest ones, oldest first."""
+        """Return the newest changes, oldest first."""
         newest = tuple(self._newest)
         return [c | {"evidence": None if evidence is None else evidence.to_json()} for c, evidence in newest]

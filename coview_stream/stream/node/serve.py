@@ -1,4 +1,4 @@
-"""Start of a node: a map file and options in, a running node out."""
+"""Start of a node, from a map file and options."""
 
 from __future__ import annotations
 
@@ -38,46 +38,46 @@ log = logging.getLogger("coview_stream.node")
 
 @dataclass(frozen=True)
 class NetworkOptions:
-    """Endpoints to connect to and to listen on, and a zenoh JSON5 file; or a ROS 2 node in place of zenoh."""
+    """Endpoints to connect to and to listen on, and a zenoh JSON5 file; or a ROS 2 node instead of zenoh."""
 
     connect: Sequence[str] = ()
     listen: Sequence[str] = ()
     zenoh_config: Path | None = None
-    ros2: Any = None  # of :func:`~coview_stream.stream.transport.ros2_node.start_node`
-    check_frames: bool = True  # of ROS 2: refuse clouds in another frame than the one whose odometry comes
+    ros2: Any = None  # from :func:`~coview_stream.stream.transport.ros2_node.start_node`
+    check_frames: bool = True  # for ROS 2: refuse clouds in another frame than that of the odometry's body
 
 
 @dataclass(frozen=True)
 class CodecOptions:
     """Encodings of messages."""
 
-    cloud: str | None = None  # of all clouds, in place of their own encoding; None believes them
-    odometry: str | None = None  # likewise
-    pose: str | None = None  # of the poses; None is the preset's
-    geo: str | None = None  # of the poses as places on Earth; None publishes none
+    cloud: str | None = None  # for all clouds, overriding their own encoding; None: their own
+    odometry: str | None = None  # the same for odometry
+    pose: str | None = None  # of the poses; None: the preset's
+    geo: str | None = None  # of the poses as places on Earth; None: not published
 
 
 @dataclass(frozen=True)
 class ServeOptions:
-    """Options of ``serve``; ConfigError if robots cannot be told apart by their keys."""
+    """Options of ``serve``; ConfigError if the keys do not distinguish the robots."""
 
     map_path: Path  # argument of :func:`~coview_stream.basemap.joined.load_map`
     keys: Sequence[RobotKeys]  # of each robot
-    network: NetworkOptions = field(default_factory=NetworkOptions)  # how the network is reached
+    network: NetworkOptions = field(default_factory=NetworkOptions)  # access to the network
     codecs: CodecOptions = field(default_factory=CodecOptions)  # encodings of messages
     node: NodeConfig = field(default_factory=NodeConfig)  # rates and limits
-    localizer: LocalizerConfig = field(default_factory=LocalizerConfig)  # configuration of the engines
-    lidar: LidarOdometryConfig | None = None  # how odometry is computed from the clouds; None if the robots send theirs
-    state: Path | None = None  # directory of the robots' last places; None for none
-    # of the places of robots, by name: tried, never trusted
+    localizer: LocalizerConfig = field(default_factory=LocalizerConfig)  # of the engines
+    lidar: LidarOdometryConfig | None = None  # how odometry is computed from clouds; None: robots send it
+    state: Path | None = None  # directory of the robots' last places; None: not kept
+    # guesses of robots' places, by name: tried, never trusted
     guesses: Mapping[str, PlaceGuess] = field(default_factory=dict)
-    mirrors: Sequence[Mirror] = ()  # of the sites elsewhere that the map is made of, whose changes are followed
-    # public key that the map has to be signed with, also after a reload; None for any map
+    mirrors: Sequence[Mirror] = ()  # of the remote sites that form the map, whose changes are followed
+    # public key that must have signed the map, also after a reload; None: any map
     verify_key: VerifyKey | None = None
-    # prefix of the keys of the fleet of nodes that share the robots; None: this node serves them all
+    # key prefix of the fleet of nodes that share the robots; None: this node serves them all
     fleet: str | None = None
-    node_keys: NodeKeys | None = None  # of the node's own; None for none
-    metrics: str | None = None  # ``HOST:PORT`` of health and metrics over HTTP; None for none
+    node_keys: NodeKeys | None = None  # keys of the node itself; None: none
+    metrics: str | None = None  # ``HOST:PORT`` for health and metrics over HTTP; None: none
 
     def __post_init__(self) -> None:
         check_disjoint(self.keys)
@@ -92,14 +92,14 @@ def open_node(
     """Load the map in the engines, open the network and start; an error leaves nothing running.
 
     Args:
-        options: of ``serve``.
-        cancelled: asked now and then; True gives up.
-        children: from :func:`start_children`, if the engines have been started already.
-        notifier: of systemd; the caller reports by it that the service ends.
+        options: options of ``serve``.
+        cancelled: polled; True gives up.
+        children: from :func:`start_children`, if the engines have been started.
+        notifier: for systemd; the caller uses it to report that the service ends.
 
     Raises:
         MapError: the map is unusable. TransportError: no network.
-        CancelledError: as asked. CoViewError: a library that the options ask for is missing.
+        CancelledError: cancelled. CoViewError: a library that the options need is missing.
     """
     names = ", ".join(k.robot for k in options.keys)
     begin = time.monotonic()
@@ -108,9 +108,9 @@ def open_node(
     engines: Mapping[str, EngineProcess] = {}
     transport = None
     try:
-        # for its errors and hash, while the engines start: they map it themselves
+        # for errors and its hash, while the engines start: they map the file themselves
         base_map, engines = start_engines(options, children)
-        # imported while the engines start, which takes longer
+        # imported meanwhile, as the engines take longer to start
         from coview_stream.messages import CLOUD_CODECS, ODOMETRY_CODECS, POSE_CODECS, prepare
         from coview_stream.stream.node.health import Notifier
 
@@ -182,7 +182,7 @@ def _make_node(
 
 
 def _services(options: ServeOptions, node: Node, notifier: Notifier) -> dict[str, Service]:
-    """Return the work that the options ask for besides the robots: places, sources, fleet, health, systemd."""
+    """Return the services that the options ask for: places, sources, fleet, health, systemd."""
     from coview_stream.stream.maps.map_follower import MapFollower
     from coview_stream.stream.node.fleet import Fleet
     from coview_stream.stream.node.health import NodeHealth, metrics_server
@@ -216,26 +216,26 @@ def _services(options: ServeOptions, node: Node, notifier: Notifier) -> dict[str
 def start_engines(
     options: ServeOptions, children: Mapping[str, EngineChild], base_map: BaseMap | None = None
 ) -> tuple[BaseMap, dict[str, EngineProcess]]:
-    """Check the map and have the engines, which ``children`` become, begin to open it; return it and them.
+    """Check the map and let the engines, made of ``children``, start opening it; return both.
 
-    That of searches is left to the caller to start: it would take cores from those that the node waits for.
-    ``base_map`` is the map, if it has been loaded and verified already. After an error the caller closes the children.
+    The caller starts the search engine: it would take cores from the engines that the node waits for. ``base_map`` is
+    the map, if it is already loaded and verified. After an error the caller closes the children.
 
     Raises:
-        MapError: the map is unusable. CoViewError: it lacks an array that the options ask for.
+        MapError: the map is unusable. CoViewError: it lacks an array that the options need.
     """
     base_map = base_map or load_map(options.map_path, options.verify_key)
-    # a file that has been verified here is not read again by the engines, as long as it is the same
+    # the engines do not read again a file that was verified here, while it stays the same
     trust = None if options.verify_key is None else Trust(options.verify_key, base_map.identity)
     path = options.map_path
     if base_map.path is not None and base_map.path != path.absolute():
-        # its sources may change while engines are started again: they open this very file, whose hash is known
+        # its sources may change before an engine restarts: engines open this very file, whose hash is known
         path, trust = base_map.path, None
     config = replace(options.localizer, sensor_leans=options.lidar is None)
-    # where features may be left out, the search engine finds out whether the network can be loaded: it takes 60 MB
+    # where features are optional, the search engine checks whether the network loads: that takes 60 MB
     if (missing := base_map.require_features(config.reloc, load=config.reloc == "learned")) is not None:
         log.warning("%s: %s", options.map_path, missing)
-        config = replace(config, reloc="coview")  # or the engines would say so again
+        config = replace(config, reloc="coview")  # or the engines would repeat the warning
     engines = {
         kind: EngineProcess(kind, str(path), base_map.sha256, config, trust=trust, child=child)
         for kind, child in children.items()
@@ -247,10 +247,10 @@ def start_engines(
 
 
 def open_map(options: ServeOptions, served: str, cancelled: Callable[[], bool]) -> OpenedMap | None:
-    """Open the map's file again, in new engines, until they would not keep a job waiting; None if it is ``served``.
+    """Open the map file again in new engines, until they are ready for jobs; None if it is the ``served`` map.
 
     Raises:
-        MapError: the map is unusable. CoViewError, DiedError: the engines cannot open it. CancelledError: as asked.
+        MapError: the map is unusable. CoViewError, DiedError: the engines cannot open it. CancelledError: cancelled.
     """
     from coview_stream.stream.maps.fetch_map import prepare_map
 

@@ -1,4 +1,4 @@
-"""One robot's session: its messages on their way to the engines, and its state by the engines' results.
+"""One robot's session: carries its messages to the engines, and derives its state from the engines' results.
 
 Pure logic: no thread, no network, no clock. Times called ``now`` are local and monotonic, in seconds; stamps are the
 robot's. Every method may be called from any thread.
@@ -38,13 +38,13 @@ class Session:
     """A robot's inputs, its queue to the engines and its state, behind one lock.
 
     Args:
-        keys: of the robot's messages.
-        map_sha256: of the map.
+        keys: keys of the robot's messages.
+        map_sha256: hash of the map.
         config: rates and limits.
-        codecs: of clouds and odometry, in place of the messages' own encodings.
-        parts: the maps of which the map is joined; None of one map.
+        codecs: for clouds and odometry; they override the messages' own encodings.
+        parts: the maps joined in this map; None for a single map.
         lidar: how odometry is computed from the clouds; None if the robot sends it.
-        site_sha256: of the state of a site, common to all parts of it; None: the map is a single file.
+        site_sha256: hash of the site's state, common to all its parts; None: the map is a single file.
         base_map: refuses guesses where it has no ground; None refuses none.
     """
 
@@ -57,17 +57,17 @@ class Session:
         self.map_sha256, self.site_sha256 = map_sha256, site_sha256 or map_sha256
         self.config = config or NodeConfig()
         self.parts = parts
-        self.lock = threading.RLock()  # held while several attributes are read together
+        self.lock = threading.RLock()  # held to read several attributes together
         self._codecs = codecs
         self._lidar = lidar
         self._base_map = base_map
-        self._epoch = 0  # number of the odometry frame, counted through all resets
+        self._epoch = 0  # id of the odometry frame, counted through all resets
         self.reset(forget=False)
 
     # ---- messages
 
     def on_cloud(self, sample: Sample, now: float) -> None:
-        """Take in a cloud: decode, pair with odometry, queue. Never raises for the sample's content."""
+        """Decode a cloud, pair it with odometry and queue it. The sample's content never raises."""
         try:
             message = self.inputs.decode_cloud(sample)
         except MessageError as error:
@@ -79,7 +79,7 @@ class Session:
                 self._proceed(self.inputs.add_cloud(message, now), now)
 
     def on_odometry(self, sample: Sample, now: float) -> None:
-        """Take in an odometry sample. Never raises for the sample's content."""
+        """Add an odometry sample. The sample's content never raises."""
         try:
             message = self.inputs.decode_odometry(sample)
         except MessageError as error:
@@ -91,7 +91,7 @@ class Session:
                 self._record_state()
 
     def _proceed(self, interruption: Break | None, now: float) -> None:
-        """Verify the place, or search again, where odometry was interrupted; queue the frames that have odometry."""
+        """Verify the place, or restart the search, after an interruption of odometry; queue frames with odometry."""
         if interruption is not None:
             if interruption.verify_from_ns is not None and self.robot_state.engine_has_place:
                 self.robot_state.require_verification(interruption.verify_from_ns)
@@ -103,7 +103,7 @@ class Session:
     # ---- time and other events
 
     def tick(self, now: float) -> None:
-        """Let time pass: without frames or odometry the place is lost."""
+        """Advance time: without frames or odometry the place is lost."""
         with self.lock:
             self._now = now
             self._proceed(None, now)
@@ -122,7 +122,7 @@ class Session:
             self._record_state()
 
     def restart_search(self, reason: str, forget: bool = False) -> None:
-        """Search from nothing in a new epoch; odometry stays; ``forget``: a client says that the place is wrong."""
+        """Restart the search in a new epoch; odometry stays. ``forget``: a client says that the place is wrong."""
         with self.lock:
             if forget:
                 self.hints.forget()
@@ -133,7 +133,7 @@ class Session:
             self._record_state()
 
     def reset(self, forget: bool = True) -> None:
-        """Begin again without anything. ``forget``: a client asks, and places from before are refused from now on."""
+        """Start over with nothing. ``forget``: at a client's request; earlier places are refused from now on."""
         with self.lock:
             if forget:
                 self.hints.forget()
@@ -143,16 +143,16 @@ class Session:
             self._now = float("-inf")  # local time of the newest tick
             self.counters, self.errors, self.history = Counters(), ErrorLog(), StateHistory()
             given = (self.keys, self.config, self._codecs, self.counters, self.errors)
-            # how the clouds become odometry; None if the robot sends it
+            # computes odometry from the clouds; None if the robot sends it
             self._odometry = None if self._lidar is None else LidarInputs(*given, self._lidar, self._epoch)
             self.inputs: Inputs = self._odometry or Inputs(*given)
             self.queue = EngineQueue(self.keys.robot, self._epoch, self.counters, self.errors)
             self.robot_state: RobotState = RobotState(self.keys.robot, self.map_sha256, self.counters, self.hints)
 
     def offer(self, place: LastPlace) -> bool:
-        """Hand the engine a place from before as a hypothesis; no effect once the place is known or was forgotten.
+        """Offer the engine an earlier place as a hypothesis; no effect once the place is known or was forgotten.
 
-        Returns False, and does nothing, as long as the place is one of odometry that has not come yet.
+        Returns False, and does nothing, while the place needs odometry that has not come yet.
         """
         with self.lock:
             T_map_body, newest = place.T_map_body, self.inputs.odometry.newest
@@ -165,10 +165,10 @@ class Session:
             return True
 
     def guess_place(self, guess: PlaceGuess) -> bool:
-        """Have the search try a guess; return False, and do nothing, while a place is known.
+        """Let the search try a guess; return False, and do nothing, while a place is known.
 
-        InputError: one of several maps has to be named, and none of that name is there, or one of one map is named, or
-        it has no ground there.
+        InputError: with several maps the guess names none of them; with one it names another; or the map has no ground
+        there.
         """
         if self.parts is not None:
             part = self.parts.named(guess.map)
@@ -185,36 +185,36 @@ class Session:
             return True
 
     def begin_beside(self, old: Session) -> None:
-        """Begin with the place of the robot's session on another map: a hypothesis, to be verified on this one.
+        """Start from the place of the robot's session on another map: a hypothesis, to be verified on this one.
 
-        The calibration of its sensor and odometry comes along, but for the ground, which is the survey's.
+        The calibration of sensor and odometry carries over, except for the ground, which belongs to the survey.
         """
         with old.lock:
             pose = old.robot_state.newest_pose(old.inputs.odometry)
             T_map_body = old.hints.T_map_body if pose is None else pose.T_map_body
             calibration, forgotten = old.robot_state.calibration or old.hints.calibration, old.hints.forgotten
             guess = old.hints.guess if old.parts is None and self.parts is None else None
-            with self.lock:  # as other sessions of the robot, which know nothing of each other
+            with self.lock:  # under both locks: other sessions of the robot are independent
                 self.inputs.continue_from(old.inputs)
         with self.lock:
-            # without its circle, which is the old map's
+            # without its circle, which belongs to the old map
             self.hints.offer_guess(None if guess is None else replace(guess, within=None))
             self.hints.forgotten = forgotten
             if T_map_body is not None:
                 self.hints.offer(T_map_body, None if calibration is None else replace(calibration, ground=0.0))
 
     def continue_from(self, old: Session) -> None:
-        """Go on where the robot's session on another map stops: its counters, its transitions, its newest pose."""
+        """Continue where the robot's session on another map stops: its counters, transitions and newest pose."""
         with old.lock, self.lock:
             vars(self.counters).update(vars(old.counters))
             self.history = old.history
             self.robot_state.publish_after(old.robot_state)
             self._record_state()
 
-    # ---- the engines; the result or failure of each job has to come back before the next one of its kind is taken
+    # ---- the engines; a job's result or failure must come back before the next job of its kind is taken
 
     def has_job(self, engine: str) -> bool:
-        """Whether there is a job for ``track``, ``search`` or ``odometry``; without the lock: perhaps no more."""
+        """Whether ``track``, ``search`` or ``odometry`` has a job; read without the lock, so it may be gone."""
         if engine == "track":
             return self.queue.has_frame
         if engine == "odometry":
@@ -231,7 +231,7 @@ class Session:
             return self.queue.take_search_request()
 
     def handle_result(self, job: Job, result: Result, now: float) -> None:
-        """Apply the result of a job at local time ``now``: a fix at once, that of a search with the next frame."""
+        """Apply a job's result at local time ``now``: a fix at once, a search result with the next frame."""
         with self.lock:
             if isinstance(job, FrameJob) and isinstance(result, FrameResult):
                 frame = self.queue.frame_done(job, result, now)
@@ -248,7 +248,7 @@ class Session:
                 self._record_state()
 
     def note_doubt(self, job: Job) -> None:
-        """Give no pose until the result of a job comes: its frame contradicts the place."""
+        """Withhold poses until the result of a job comes: its frame contradicts the place."""
         with self.lock:
             self.queue.note_doubt(job)
 
@@ -258,7 +258,7 @@ class Session:
             if isinstance(job, FrameJob):
                 if self.queue.frame_failed(job, reason, rejected) and not rejected:
                     if job.hint is not None:
-                        self.hints.drop()  # it may be the reason
+                        self.hints.drop()  # it may be the cause
                     self.restart_search("the engine failed on a frame")
             elif isinstance(job, SearchJob):
                 self.queue.search_failed(job, reason)
@@ -266,7 +266,7 @@ class Session:
                 self.restart_search(interruption.reason)
 
     def engine_restarted(self, engine: str = "track", why: str = "it died") -> None:
-        """Note that an engine has forgotten everything: ``track`` the place, ``odometry`` the way."""
+        """Note that an engine has forgotten everything: ``track`` the place, ``odometry`` the path driven."""
         with self.lock:
             self.counters.engine_restarts += 1
             # logged once for all robots
@@ -282,10 +282,10 @@ class Session:
     # ---- published
 
     def pose(self) -> PoseMessage | None:
-        """Return the newest odometry corrected by the newest fix, with that odometry's stamp; None unless TRACKING.
+        """Return the newest odometry corrected by the newest fix, with the odometry's stamp; None unless TRACKING.
 
-        None as well while a frame that contradicts the place is worked on: other places are tried for up to a second.
-        Of several maps it is in the frame of the robot's map, whose name is its ``frame_id``.
+        Also None while a frame that contradicts the place is processed: other places are tried for up to a second. With
+        several maps the pose is in the frame of the robot's map, whose name is its ``frame_id``.
         """
         with self.lock:
             pose = None if self.queue.in_doubt else self.robot_state.pose(self.inputs.odometry)
@@ -296,7 +296,7 @@ class Session:
         return replace(pose, T_map_body=part.own(pose.T_map_body), T_map_odom=T_map_odom, frame_id=part.name)
 
     def state(self) -> tuple[State, str]:
-        """Return the state and one clause that gives its reason."""
+        """Return the state and its reason in one clause."""
         with self.lock:
             state, reason = self.robot_state.state, self.robot_state.reason(self.queue.pending_search(self._now))
             if reason is None:
@@ -304,13 +304,13 @@ class Session:
             elif not state.has_place:
                 now = self.inputs.silent(self._now) or self.robot_state.searched()
                 if now and now.partition(" for ")[0] == reason.partition(" for ")[0]:
-                    reason = now  # of the same input, which is silent since
+                    reason = now  # of the same input, still silent
                 elif now:
                     reason = f"{now}; before: {reason}"
             return state, reason
 
     def last_place(self) -> LastPlace | None:
-        """Return the place of the robot, for the next start or another node; None unless TRACKING."""
+        """Return the robot's place, for the next start or another node; None unless TRACKING."""
         with self.lock:
             pose = self.robot_state.newest_pose(self.inputs.odometry)
             if pose is None:
@@ -319,7 +319,7 @@ class Session:
             return LastPlace(self.site_sha256, pose.stamp_ns, pose.T_map_body, pose.T_map_odom, calibration)
 
     def _record_state(self) -> None:
-        """Add the state to the history, wherever it may have changed; errors from before a robot is found are over."""
+        """Add the state to the history where it may have changed; once the robot is found, earlier errors are over."""
         state, reason = self.robot_state.state, self.robot_state.reason() or self.inputs.waiting_for()
         changed = self.history.add(state, reason, self.robot_state.last_frame_ns, self.robot_state.evidence)
         if changed and state is State.TRACKING:

@@ -1,4 +1,4 @@
-"""Statuses of all robots: the document, its size, its times, and the connection that it shows."""
+"""Statuses of all robots: their content, size and times, and the connection that they show."""
 
 from __future__ import annotations
 
@@ -26,24 +26,24 @@ from coview_stream.version import __version__
 log = logging.getLogger("coview_stream.node")
 
 MAX_STATUS = 3500
-"""Bytes of a status at most; a usual one has 2,000. A default zenoh-pico loses one of 5 kB silently."""
+"""Largest status, bytes; usual are 2,000. A default zenoh-pico loses one of 5 kB silently."""
 
 _JSON = "application/json"
-_MIN_INTERVAL = 0.02  # seconds between two rounds: many changes at once are one status each, not a flood
+_MIN_INTERVAL = 0.02  # seconds between rounds: many changes at once give one status each, not a flood
 _TEXT, _SHORT_TEXT = 300, 100  # characters
-_LOG_INTERVAL = 10.0  # seconds between lines about one robot whose state stays and whose reason changes
+_LOG_INTERVAL = 10.0  # seconds between lines about a robot whose reason changes but not its state
 
 
 class Reporter:
-    """Publishes the statuses of all robots. A robot's error silences no other robot."""
+    """Publishes the statuses of all robots. A robot's error does not silence the others."""
 
     def __init__(
         self, sessions: Sequence[Session], transport: Transport, errors: RateLimitedErrors, identity: NodeIdentity
     ) -> None:
         self.identity = identity
-        self.changed = threading.Event()  # to be set when a state may have changed
-        self.rates = {s.keys.robot: PoseRate() for s in sessions}  # of poses, which are added when they go out
-        self.served: set[str] = set()  # robots that this node serves: of all others nothing is published
+        self.changed = threading.Event()  # set when a state may have changed
+        self.rates = {s.keys.robot: PoseRate() for s in sessions}  # of published poses
+        self.served: set[str] = set()  # robots that this node serves: only these are published
         self._sessions = sessions
         self._transport = transport
         self._errors = errors
@@ -55,13 +55,13 @@ class Reporter:
         self._hypotheses: dict[str, Publisher] = {}
 
     def declare(self, session: Session) -> None:
-        """Declare a robot's status, and the hypotheses of its search."""
+        """Declare the publishers of a robot's status and of its search hypotheses."""
         keys = session.keys
         self._publishers[keys.robot] = self._transport.publisher(keys.status, "report")
         self._hypotheses[keys.robot] = self._transport.publisher(keys.hypotheses, "report")
 
     def report_change(self, session: Session) -> None:
-        """Have the status published at once if the robot's state is another than in its last status."""
+        """Publish the status at once if the robot's state differs from its last status."""
         if self._has_changed(session):
             self.changed.set()
 
@@ -70,7 +70,7 @@ class Reporter:
         return (session.state()[0].reported, robot in self.served) != self._reported.get(robot)
 
     def run(self, rate: float, stopping: threading.Event) -> None:
-        """Publish at ``rate``, and changes at once, until ``stopping``; set ``changed`` as well, to end."""
+        """Publish at ``rate``, and changes at once, until ``stopping``; to end it set ``changed`` too."""
         clock = Rate(rate, time.monotonic())
         while not stopping.is_set():
             self.changed.wait(timeout=clock.remaining(time.monotonic()))
@@ -98,7 +98,7 @@ class Reporter:
                     self._hypotheses[robot].put(encode_hypotheses(message))
 
     def publish_last(self, now: float) -> None:
-        """Publish that the node ends, and no robot is tracked any more."""
+        """Publish that the node ends and tracks no robot."""
         for session in self._sessions:
             with self._errors.catch(f"{session.keys.robot}: status"):
                 self._publish_status(session, now, closing=True)
@@ -107,7 +107,7 @@ class Reporter:
         robot = session.keys.robot
         state, reason = session.state()
         before, _ = self._reported.get(robot, ("", False))
-        self._reported[robot] = state.reported, robot in self.served  # even if it fails: not tried again at once
+        self._reported[robot] = state.reported, robot in self.served  # even on failure: not retried at once
         kind, (logged, at) = re.sub(r"[\d.,]+", "", reason), self._logged.get(robot, ("", now))
         new_reason = kind != logged and now - at >= _LOG_INTERVAL and not state.has_place
         if (state.reported != before or new_reason) and not closing:
@@ -130,7 +130,7 @@ class Reporter:
 
 
 def status(session: Session, connection: Connection, reconnects: int, rate: float, uptime: float) -> dict[str, Any]:
-    """Return the plain data of ``out/status``; its ``stamp_ns`` is the node's wall clock, all others the robot's."""
+    """Return ``out/status`` as plain data; its ``stamp_ns`` is the node's wall clock, all other stamps the robot's."""
     with session.lock:
         state, reason = session.state()
         robot, queue, odometry = session.robot_state, session.queue, session.inputs.odometry
@@ -166,7 +166,7 @@ def status(session: Session, connection: Connection, reconnects: int, rate: floa
 
 
 def map_name(session: Session) -> str | None:
-    """Return the robot's map of several; None while that is not known, and of one map."""
+    """Return which of several maps the robot is on; None while unknown, and for a single map."""
     correction = session.robot_state.correction
     if session.parts is None or correction is None or correction.fix.T_map_body is None:
         return None
@@ -174,7 +174,7 @@ def map_name(session: Session) -> str | None:
 
 
 def hypotheses(session: Session) -> HypothesesMessage | None:
-    """Return the places that a robot's search considers; None while there is a place, and before the first search."""
+    """Return the places that a robot's search considers; None with a place, and before the first search."""
     with session.lock:
         considered = session.queue.considered
         if considered is None or session.robot_state.state.has_place:
@@ -193,10 +193,10 @@ def hypotheses(session: Session) -> HypothesesMessage | None:
 
 
 def encode_status(document: dict[str, Any]) -> bytes:
-    """Encode a status (JSON) in at most :data:`MAX_STATUS` bytes.
+    """Encode a status as JSON in at most :data:`MAX_STATUS` bytes.
 
-    A longer one loses its least important parts first, and ``shortened`` names them: ids of the others on the network,
-    evidence of past changes of state, old errors, past changes, the end of long texts.
+    A longer one loses its least important parts first, and ``shortened`` names them: ids of others on the network,
+    evidence of past state changes, old errors, past changes, the ends of long texts.
     """
     text = _encode(document)
     if len(text) <= MAX_STATUS:
@@ -220,7 +220,7 @@ _ESSENTIAL = (
 
 
 def _shorten(document: dict[str, Any]) -> Iterator[str]:
-    """Shorten one part of a status after the other in place, and yield its name."""
+    """Shorten one part of a status after another in place; yield the name of each."""
     connection, transitions = document["connection"], document["transitions"]
     for name in ("routers", "peers"):
         connection[name] = connection[name][:2]
@@ -239,7 +239,7 @@ def _shorten(document: dict[str, Any]) -> Iterator[str]:
     if document["calibration"]:
         document["calibration"]["says"] = [_cut(text, _SHORT_TEXT) for text in document["calibration"]["says"][:3]]
     yield "reason"
-    for name in document.keys() - set(_ESSENTIAL):  # names and texts of hundreds of characters alone lead here
+    for name in document.keys() - set(_ESSENTIAL):  # only names and texts of hundreds of characters lead here
         del document[name]
     document["reason"] = _cut(document["reason"], _SHORT_TEXT)
     yield "all but the state"
@@ -253,15 +253,15 @@ def _cut(text: str, length: int) -> str:
 
 
 class ConnectionMonitor:
-    """Routers and peers that the node is connected to, and their changes. Pure."""
+    """Routers and peers that the node is connected to, and their changes. Pure logic."""
 
     def __init__(self) -> None:
         self.connection = Connection()
-        self.reconnects = 0  # times that a router came back, or another took its place; peers come and go
-        self._missing: set[str] = set()  # routers that have gone and have not been replaced
+        self.reconnects = 0  # times a router returned or another replaced it; peers come and go
+        self._missing: set[str] = set()  # routers that have gone without a replacement
 
     def update(self, connection: Connection) -> None:
-        """Take in the connection as it is now, and log its changes."""
+        """Take the present connection, and log its changes."""
         before, self.connection = self.connection, connection
         for zid in sorted(set(connection.peers) - set(before.peers)):
             log.info("peer %s is connected", zid)
@@ -275,7 +275,7 @@ class ConnectionMonitor:
             for zid in sorted(come):
                 how = "again" if zid in self._missing else f"instead of {', '.join(sorted(self._missing))}"
                 log.info("connected to router %s %s", zid, how)
-            # one that took another's place need not go for the other to be missed no more
+            # a router that replaced another may stay when that one returns: then the other is no longer missing
             self._missing = self._missing - come if come & self._missing else set()
         elif come:
             log.info("connected to router %s", ", ".join(sorted(come)))

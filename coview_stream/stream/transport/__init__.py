@@ -1,1 +1,1 @@
-"""Zenoh sessions, keys and queries; the in-memory transport of tests."""
+"""Zenoh sessions, keys and queries; the in-memory transport for tests."""

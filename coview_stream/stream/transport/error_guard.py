@@ -1,4 +1,4 @@
-"""Guard of handlers: their errors are logged at a limited rate and never end a thread."""
+"""Guard of handlers: logs their errors at a limited rate and keeps threads alive."""
 
 from __future__ import annotations
 
@@ -13,27 +13,27 @@ from coview_stream.errors import printable
 
 
 def is_panic(error: BaseException) -> bool:
-    """Tell whether a Rust library panicked: pyo3's PanicException is no Exception, and nothing exports it to import."""
+    """Whether a Rust library panicked: pyo3's PanicException is no Exception, and cannot be imported."""
     return type(error).__name__ == "PanicException"
 
 
-_MAX_PLACES = 256  # of more, those of the oldest lines are forgotten: strangers may choose keys
+_MAX_PLACES = 256  # beyond it the places of the oldest lines are forgotten: strangers may choose keys
 
 
 @dataclass
 class Caught:
-    """Error of a block of :meth:`RateLimitedErrors.catch`; None if it ended without one."""
+    """Error raised in a block of :meth:`RateLimitedErrors.catch`; None without one."""
 
     error: Exception | None = None
 
 
 class RateLimitedErrors:
-    """Log of errors from handlers: the first of each kind at once, then at most one line per ``interval``.
+    """Log of handler errors: the first of each kind at once, then at most one line per ``interval``.
 
     Args:
-        logger: takes the lines.
-        interval: seconds between two lines about the same place.
-        clock: seconds, monotonic.
+        logger: receives the lines.
+        interval: seconds between lines about the same place.
+        clock: monotonic, seconds.
     """
 
     def __init__(
@@ -48,11 +48,11 @@ class RateLimitedErrors:
 
     @contextmanager
     def catch(self, place: str) -> Iterator[Caught]:
-        """Log an error that the block raises as one at ``place``, and go on after the block."""
+        """Log an error raised in the block as one at ``place``, and continue after the block."""
         caught = Caught()
         try:
             yield caught
-        except Exception as error:  # of any kind: the thread goes on with the next message
+        except Exception as error:  # of any kind: the thread continues with the next message
             self.report(place, error)
             caught.error = error
         except BaseException as error:
@@ -62,7 +62,7 @@ class RateLimitedErrors:
             caught.error = RuntimeError(str(error))
 
     def report(self, place: str, error: BaseException, kind: str = "") -> None:
-        """Log ``error`` unless a line about ``place``, and of this ``kind``, was logged less than the interval ago."""
+        """Log ``error``, unless a line about ``place`` and ``kind`` was logged within the interval."""
         about = f"{place}: {kind}"
         with self._lock:
             now = self._clock()

@@ -1,8 +1,7 @@
 """HTTP server of a node's page, metrics and health: GET only, with limits on time, size and connections.
 
-Nothing in a request is acted upon. Requests are refused whose Host is no address, no name without a dot and not the
-server's own, because a page of another site may have its name point here (DNS rebinding), and no other origin may read
-its replies.
+Requests cause no action. A request is refused unless its Host is an address, a name without a dot or the server's own
+name: a page of another site may make its name resolve to this server (DNS rebinding). No other origin may read replies.
 """
 
 from __future__ import annotations
@@ -25,13 +24,13 @@ from coview_stream.stream.transport.error_guard import RateLimitedErrors
 
 log = logging.getLogger("coview_stream.web")
 
-# limits of a server for people and scrapers: far above their use, far below any harm
-MAX_CONNECTIONS = 32  # from other machines, and as many from this one
-_MAX_SECONDS = 2.0  # of receiving a request
+# limits for people and scrapers: far above their use, far below any harm
+MAX_CONNECTIONS = 32  # from other machines, and the same from this one
+_MAX_SECONDS = 2.0  # to receive a request
 _MAX_BYTES = 8192  # of a request
 _SEND_TIMEOUT = 4.0  # seconds for a reader to take more of a reply
 _SEND_BUFFER = 1 << 18  # bytes of a stream in flight
-_POLL = 0.2  # seconds between two looks at the stop flag
+_POLL = 0.2  # seconds between checks of the stop flag
 
 _HEADERS = {
     "Content-Security-Policy": "default-src 'none'; script-src 'self'; style-src 'self'; img-src 'self'; "
@@ -54,24 +53,24 @@ class Reply:
 
 
 EventStream = Generator[bytes, None, None]
-"""Server-sent events; closed when the reader has gone."""
+"""Server-sent events; closed when the reader leaves."""
 
 Route = Callable[[str], Reply | EventStream]
 """Handler of a path, or of all paths below one that ends with ``/``; takes the rest of the path."""
 
 
 class HttpServer:
-    """Server of some routes on one address, ``HOST:PORT``; port 0 takes any free one. There is no password.
+    """Server of some routes on one address, ``HOST:PORT``; port 0 takes any free port. There is no password.
 
-    ``url`` is that of the root, with a final ``/``.
+    ``url`` is the root's, with a final ``/``.
 
     Args:
-        address: to listen on.
+        address: address to listen on.
         routes: handlers by path.
-        option: command-line option of the address and a valid value, for messages.
+        option: command-line option for the address and a valid value, for messages.
 
     Raises:
-        ConfigError: the address is malformed or cannot be listened on.
+        ConfigError: the address is malformed or cannot be bound.
     """
 
     def __init__(self, address: str, routes: Mapping[str, Route], option: tuple[str, str]) -> None:
@@ -110,8 +109,8 @@ class HttpServer:
 
 
 def is_loopback(host: str) -> bool:
-    """Whether only this machine reaches an address."""
-    host = host.removeprefix("::ffff:")  # of IPv4 on a socket for both
+    """Whether only this machine can reach an address."""
+    host = host.removeprefix("::ffff:")  # of IPv4 on a dual-stack socket
     try:
         return ipaddress.ip_address(host).is_loopback
     except ValueError:
@@ -119,7 +118,7 @@ def is_loopback(host: str) -> bool:
 
 
 def known_host(header: str | None, own: str) -> bool:
-    """Whether a Host header names this server: by an address, its configured name, or one without a dot.
+    """Whether a Host header names this server: by an address, its configured name, or a name without a dot.
 
     Names without a dot (``localhost``, a host or a service of the local network) cannot be registered by a stranger.
     """
@@ -139,7 +138,7 @@ def known_host(header: str | None, own: str) -> bool:
 
 
 class _LimitedRequest(io.RawIOBase):
-    """Bytes of a request up to the limits of size and time, then its end."""
+    """Bytes of a request up to the size and time limits, then end of file."""
 
     def __init__(self, connection: socket.socket) -> None:
         super().__init__()
@@ -175,7 +174,7 @@ class _Server(ThreadingHTTPServer):
         self.routes, self.host = routes, address[0]
         self._name = name
         self._errors = RateLimitedErrors(log)
-        # by whether it comes from this machine, whose health check must not wait for the readers elsewhere
+        # whether from this machine: its health checks must not wait for remote readers
         self._free = {local: threading.BoundedSemaphore(MAX_CONNECTIONS) for local in (True, False)}
         super().__init__(address, _Handler)
 
@@ -184,7 +183,7 @@ class _Server(ThreadingHTTPServer):
         self.server_name, self.server_port = str(self.server_address[0]), int(self.server_address[1])
 
     def process_request(self, request: Any, client_address: Any) -> None:
-        """Serve on a thread, or hang up where too many connections are open."""
+        """Serve on a thread, or hang up if too many connections are open."""
         free = self._free[is_loopback(str(client_address[0]))]
         if free.acquire(blocking=False):
             try:
@@ -202,7 +201,7 @@ class _Server(ThreadingHTTPServer):
             self._free[is_loopback(str(client_address[0]))].release()
 
     def handle_error(self, request: Any, client_address: Any) -> None:
-        """Report our own errors; a reader that leaves or is cut off is none."""
+        """Report our own errors; a reader that leaves or is cut off is not an error."""
         error = sys.exception()
         if error is not None and not isinstance(error, OSError):
             self._errors.report(self._name, error)
@@ -237,7 +236,7 @@ class _Handler(BaseHTTPRequestHandler):
             return
         try:
             self.connection.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, _SEND_BUFFER)
-            first = next(reply)  # from here on its end is run by close()
+            first = next(reply)  # from here on close() runs its end
             self._begin(200, "text/event-stream; charset=utf-8", None)
             self.wfile.write(first)
             for events in reply:

@@ -1,7 +1,7 @@
-"""Keys of a robot's traffic, by presets for the conventions in use, and the identity of a node.
+"""Keys of a robot's traffic, in presets for the conventions in use, and the identity of a node.
 
 ``native`` is ours; ``ros2dds`` follows zenoh-bridge-ros2dds, ``rmw_zenoh`` ROS 2's own zenoh middleware and ``keelson``
-RISE's maritime protocol. Status, liveliness and rpc stay native in all of them: no other convention has them. No robot
+RISE's maritime protocol. Status, liveliness and rpc stay native in all presets: no other convention has them. No robot
 may read another's messages, and no pose may come back as input.
 """
 
@@ -26,7 +26,7 @@ def check_chunk(text: str, option: str) -> str:
     """Return ``text`` if it can be one chunk of a key, such as a robot's name; ``option`` names it in errors.
 
     Raises:
-        ConfigError: if it is empty, starts with ``@``, or holds one of ``/*$?#`` or unprintable characters.
+        ConfigError: it is empty, starts with ``@``, or contains one of ``/*$?#`` or unprintable characters.
     """
     if not text:
         raise ConfigError(f"{option} is empty: give it a name")
@@ -57,7 +57,7 @@ def _checked_plain(chunk: str, text: str, option: str) -> str:
 def check_expression(text: str, option: str, wildcards: bool = True) -> str:
     """Return ``text`` if it is a key expression in zenoh's canonical form, else raise ConfigError about ``option``.
 
-    Without ``wildcards`` (``*``, ``**`` and ``$*``) it must be a key to publish on.
+    Without ``wildcards`` (``*``, ``**`` and ``$*``) it must be a key to publish to.
     """
     chunks = text.split("/")
     for chunk in chunks:
@@ -79,7 +79,7 @@ def check_expression(text: str, option: str, wildcards: bool = True) -> str:
 
 
 def matches(expression: str, key: str) -> bool:
-    """Tell whether two valid key expressions have a key in common; a plain ``key``: whether ``expression`` holds it."""
+    """Whether two valid key expressions have a key in common; for a plain ``key``: whether ``expression`` matches."""
     import zenoh
 
     return bool(zenoh.KeyExpr(expression).intersects(zenoh.KeyExpr(key)))
@@ -96,10 +96,9 @@ _INPUT_OPTIONS = ("--cloud-key", "--odometry-key")
 
 @dataclass(frozen=True, kw_only=True)
 class Preset:
-    """Templates of keys, in which ``{base}``, ``{robot}``, ``{domain}`` and ``{pose_hash}`` are filled in, and formats.
+    """Templates of keys, with ``{base}``, ``{robot}``, ``{domain}`` and ``{pose_hash}`` to fill in, and formats.
 
-    ``hint`` is the codec of a convention whose messages come and go without Encoding; None where Encoding, key or
-    payload say it.
+    ``hint`` is the codec of a convention whose messages have no Encoding; None if Encoding, key or payload identify it.
     """
 
     cloud: str  # key expression of lidar frames
@@ -110,7 +109,7 @@ class Preset:
 
     @property
     def pose_format(self) -> str:
-        """Codec that poses are written with, unless the user asks for another."""
+        """Codec of published poses, unless the user chooses another."""
         return self.hint or "json"
 
 
@@ -119,7 +118,7 @@ PRESETS: dict[str, Preset] = {
         cloud="{base}/{robot}/in/cloud", odometry="{base}/{robot}/in/odom", pose="{base}/{robot}/out/pose"
     ),
     "ros2dds": Preset(cloud="{robot}/points", odometry="{robot}/odom", pose="{robot}/coview/pose", hint="cdr"),
-    # the last part of an input is the type's hash: '*' takes every ROS 2 release's, Humble's too
+    # the last part of an input is the type's hash: '*' accepts every ROS 2 release, Humble too
     "rmw_zenoh": Preset(
         cloud=f"{{domain}}/{{robot}}/points/{_CLOUD_DDS}/*",
         odometry=f"{{domain}}/{{robot}}/odom/{_ODOMETRY_DDS}/*",
@@ -127,8 +126,8 @@ PRESETS: dict[str, Preset] = {
         hint="cdr",
         rmw=True,
     ),
-    # keelson has no subject for a pose in a map frame, only foxglove.FrameTransform: ours is map -> body, from the
-    # source 'coview'; odometry therefore must name its source, or it would match our own poses
+    # keelson has no subject for a pose in a map frame, only foxglove.FrameTransform: ours is map -> body, from source
+    # 'coview'; odometry must therefore name its source, or it would match our own poses
     "keelson": Preset(
         cloud="{base}/@v0/{robot}/pubsub/point_cloud/**",
         odometry="{base}/@v0/{robot}/pubsub/frame_transform/odometry/**",
@@ -142,32 +141,32 @@ PRESETS: dict[str, Preset] = {
 class RobotKeys(Preset):
     """A preset filled in for one robot, with the keys that are native in all presets."""
 
-    robot: str  # its name
+    robot: str  # the robot's name
     status: str
     hypotheses: str  # places that a search considers
-    location: str  # places on Earth, if they are asked for
+    location: str  # places on Earth, if requested
     alive: str  # of the liveliness token
     relocalize: str  # query: forget the pose and search again
-    initial_pose: str  # subscribed to, for guesses of the place
+    initial_pose: str  # subscribed to for guesses of the place
     suggest: str  # query: a guess of the place in its parameters
     reset: str  # query: forget everything
-    map_view: str  # query: the map, thinned, to look at
+    map_view: str  # query: a thinned map to display
 
 
 @dataclass(frozen=True)
 class NodeKeys:
-    """Keys of a node, whichever robots it serves; no wildcard matches them, for ``@node`` is a verbatim chunk."""
+    """Keys of a node, whichever robots it serves; no wildcard matches them, as ``@node`` is a verbatim chunk."""
 
-    health: str  # its health and metrics, once a second
+    health: str  # health and metrics, once a second
     ask_health: str  # query: the same
     reload: str  # query: open the map's file again
 
 
-ANY = "*"  # of the names of nodes
+ANY = "*"  # any node name
 
 
 def node_keys(base: str, name: str) -> NodeKeys:
-    """Return the keys of the node called ``name``, or of ANY; ConfigError if that is not one chunk of a key."""
+    """Return the keys of the node called ``name``, or of ANY; ConfigError if it is not one chunk of a key."""
     own = f"{check_prefix(base, '--base')}/@node/{ANY if name == ANY else check_chunk(name, '--node')}"
     return NodeKeys(f"{own}/out/health", f"{own}/rpc/health", f"{own}/rpc/reload")
 
@@ -182,7 +181,7 @@ def robot_keys(
     domain: int = 0,
     humble: bool = False,
 ) -> RobotKeys:
-    """Fill a preset in for one robot.
+    """Fill in a preset for one robot.
 
     Args:
         preset: ``native``, ``ros2dds``, ``rmw_zenoh`` or ``keelson``.
@@ -190,13 +189,13 @@ def robot_keys(
         robot: the robot's name, one chunk; in ROS its namespace.
         cloud: key expression instead of the preset's; ``{base}``, ``{robot}`` and ``{domain}`` are filled in.
         odometry: the same for odometry.
-        pose: the same for poses; a plain key, without wildcards; with ``rmw_zenoh`` it keeps
-            the convention's form, and ``{pose_hash}`` is filled in too.
+        pose: the same for poses: a plain key without wildcards; with ``rmw_zenoh`` it keeps the convention's form, and
+            ``{pose_hash}`` is filled in too.
         domain: ROS domain id, 0 to 232.
         humble: name types as ROS 2 Humble does, without a hash.
 
     Raises:
-        ConfigError: if the preset is unknown, or a name or key is not valid in zenoh.
+        ConfigError: the preset is unknown, or a name or key is invalid in zenoh.
     """
     if preset not in PRESETS:
         raise ConfigError(f"--preset {preset!r} is unknown: choose one of {', '.join(PRESETS)}")
@@ -243,11 +242,11 @@ def _filled(template: str, values: dict[str, str], option: str, wildcards: bool 
 
 
 def check_disjoint(keys: Sequence[RobotKeys]) -> None:
-    """Check the keys of all robots that one node serves.
+    """Check the keys of all robots of one node.
 
     Raises:
-        ConfigError: a name is given twice, two robots would read the same messages or write poses on one key, or a
-            pose would come back as input.
+        ConfigError: a name occurs twice, two robots would read the same messages or write poses to one key, or a pose
+            would come back as input.
     """
     names = [k.robot for k in keys]
     if len(set(names)) < len(names):
@@ -276,30 +275,30 @@ def check_disjoint(keys: Sequence[RobotKeys]) -> None:
                     )
 
 
-_MAX_STATUS = 65_536  # bytes of a status that is read
+_MAX_STATUS = 65_536  # bytes of a status to read
 _MAX_NAME = 64  # characters of a node's name or host
-_MAX_PERIOD = 60.0  # seconds between two statuses
+_MAX_PERIOD = 60.0  # seconds between statuses
 
 
 @dataclass(frozen=True)
 class NodeIdentity:
-    """Identity of a node in its statuses: a unique ``node``, its ``host`` for people, seconds between its statuses."""
+    """Identity of a node in its statuses: a unique ``node``, its ``host`` for people, seconds between statuses."""
 
     node: str = field(default_factory=lambda: uuid.uuid4().hex[:12])
     host: str = field(default_factory=lambda: socket.gethostname()[:_MAX_NAME])
     period: float = 1.0
-    ending: bool = False  # it serves no longer
+    ending: bool = False  # it no longer serves
 
     def __str__(self) -> str:
         return f"{self.node} on {self.host}" if self.host else self.node
 
     def to_json(self, ending: bool = False) -> dict[str, Any]:
-        """Return it as it stands in a status."""
+        """Return its form in a status."""
         return {"id": self.node, "period_s": self.period, "ending": ending, "host": self.host}
 
     @classmethod
     def read(cls, status: bytes) -> NodeIdentity | None:
-        """Return the identity in a status, from anyone; None where none can be read."""
+        """Return the identity in a status, from anyone; None if unreadable."""
         if len(status) > _MAX_STATUS:
             return None
         try:
@@ -314,5 +313,5 @@ class NodeIdentity:
 
 
 def _is_name(text: object) -> bool:
-    """Whether it can be logged."""
+    """Whether a text can be logged as a name."""
     return isinstance(text, str) and len(text) <= _MAX_NAME and text.isprintable()

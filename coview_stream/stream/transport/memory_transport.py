@@ -1,7 +1,7 @@
-"""In-memory transport for tests of nodes and clients, as httpx's ``MockTransport`` is for HTTP.
+"""In-memory transport for tests of nodes and clients, like httpx's ``MockTransport`` for HTTP.
 
-It has no threads and no clock: every call is finished when it returns. Public: pass it wherever a
-:class:`~coview_stream.stream.transport.transport.Transport` is asked for.
+It has no threads and no clock: every call is complete when it returns. Public: pass it as a
+:class:`~coview_stream.stream.transport.transport.Transport`.
 """
 
 from __future__ import annotations
@@ -44,9 +44,9 @@ class MemoryTransport:
 
     Attributes:
         published: every sample that reached the network, in order, from publishers and from :meth:`publish`.
-        publishers: every publisher that was declared.
+        publishers: every declared publisher.
         lost: number of samples published while the network was away.
-        raised: errors of handlers, in order.
+        raised: exceptions raised by handlers, in order.
         closed: whether :meth:`close` was called.
     """
 
@@ -65,7 +65,7 @@ class MemoryTransport:
     # for the node or client under test
 
     def subscribe(self, key: str, handler: Callable[[Sample], None], policy: Policy) -> Callable[[], None]:
-        """Call ``handler`` within each matching publication; nothing is ever queued, so both policies are the same."""
+        """Call ``handler`` within each matching publication; nothing is queued, so both policies are the same."""
         subscription = (check_expression(key, "key"), handler, policy)
         self._subscriptions.append(subscription)
 
@@ -82,7 +82,7 @@ class MemoryTransport:
         return publisher
 
     def answer(self, key: str, handler: Callable[[dict[str, str]], dict[str, Any]]) -> Callable[[], None]:
-        """Answer :meth:`query`; of several answers to one key the first declared one replies."""
+        """Answer :meth:`query`; of several answers to one key the first declared replies."""
         answer = (check_expression(key, "key"), handler)
         self._answers.append(answer)
 
@@ -99,7 +99,7 @@ class MemoryTransport:
     def query(
         self, key: str, parameters: dict[str, str] | None = None, timeout: float = 5.0, max_bytes: int = MAX_REPLY
     ) -> dict[str, Any]:
-        """Call the handler that :meth:`answer` declared; TransportError without one, or if it raises."""
+        """Call the handler declared with :meth:`answer`; TransportError without one, or if it raises."""
         handler = next((handler for name, handler in self._answers if matches(name, key)), None)
         if handler is None or not self._connected:
             raise TransportError(f"{key}: no answer")
@@ -110,7 +110,7 @@ class MemoryTransport:
             raise TransportError(f"{key}: the node refused: {error}") from error
 
     def tokens(self, expression: str) -> list[str]:
-        """Return those of :attr:`announced` that match, sorted, each once."""
+        """Return the :attr:`announced` tokens that match, sorted, each once."""
         return sorted({token for token in self.announced if matches(expression, token)})
 
     def await_subscriber(self, key: str, seconds: float, wait: Callable[[float], object] = time.sleep) -> bool:
@@ -134,16 +134,16 @@ class MemoryTransport:
 
     @property
     def announced(self) -> tuple[str, ...]:
-        """Liveliness tokens that others can see right now, in the order in which they were announced."""
+        """Liveliness tokens that others can see now, in the order of their announcement."""
         return tuple(self._tokens) if self._connected else ()
 
     @property
     def subscribed(self) -> dict[str, Policy]:
-        """Key expressions subscribed to, with their policies."""
+        """Subscribed key expressions, with their policies."""
         return {key: policy for key, _, policy in self._subscriptions}
 
     def publish(self, sample: Sample) -> None:
-        """Publish as another member of the network: every matching handler has run when this returns."""
+        """Publish as another member of the network; every matching handler has run on return."""
         if not self._connected:
             self.lost += 1
             return
@@ -156,17 +156,17 @@ class MemoryTransport:
                     self.raised.append(caught.error)
 
     def samples(self, key: str) -> list[Sample]:
-        """Return what was published on keys that match ``key``, oldest first."""
+        """Return the samples published on keys that match ``key``, oldest first."""
         return [sample for sample in self.published if matches(key, sample.key)]
 
     def withdraw(self, key: str) -> None:
-        """Drop a liveliness token, as of a process that has died."""
+        """Drop a liveliness token, as if its process had died."""
         self._tokens.remove(key)
 
     def go_away(self) -> None:
-        """Take the router away: publications are lost, queries fail, tokens are gone; declarations stay."""
+        """Take the router away: publications are lost, queries fail, tokens vanish; declarations stay."""
         self._connected = False
 
     def come_back(self) -> None:
-        """Bring the router back, and with it everything declared."""
+        """Bring the router back with everything declared."""
         self._connected = True

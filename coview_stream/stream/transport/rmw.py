@@ -1,7 +1,7 @@
 """Conventions of rmw_zenoh (ROS 2 over zenoh): type names, attachments and liveliness tokens.
 
 A ROS 2 subscription drops samples without the attachment, and ``ros2 topic list`` shows only topics whose publisher
-holds a token. Formats as in ROS 2 Jazzy and newer; Humble differs in the type hash alone.
+holds a token. Formats as in ROS 2 Jazzy and newer; Humble differs only in the type hash.
 """
 
 from __future__ import annotations
@@ -15,13 +15,13 @@ from coview_stream.messages.types import Encoded
 from coview_stream.stream.transport.transport import Publisher
 
 NO_HASH = "TypeHashNotSupported"
-"""In place of the type hash, from ROS 2 Humble."""
+"""Replaces the type hash in ROS 2 Humble."""
 
 _GID = 16
 _ATTACHMENT = struct.Struct("<qqB16s")  # sequence, source time in ns, length of the gid, gid
 _QOS = "::,10:,:,:,,"  # empty fields mean rmw_zenoh's defaults: reliable, volatile; keep the last 10
 _NODE_ID = 0  # each of our sessions has one ROS node
-_ROOT = "%"  # a '/' in a name, and so the root enclave and the root namespace
+_ROOT = "%"  # a '/' in a name; hence also the root enclave and the root namespace
 
 
 def dds_type(name: str) -> str:
@@ -39,12 +39,12 @@ def type_hash(name: str, humble: bool = False) -> str:
 
 
 def attachment(sequence: int, stamp_ns: int, gid: bytes) -> bytes:
-    """Write 33 bytes: running number from 1, source time in nanoseconds, and the publisher's 16-byte identity."""
+    """Pack 33 bytes: sequence number from 1, source time in nanoseconds, and the publisher's 16-byte identity."""
     return _ATTACHMENT.pack(sequence, stamp_ns, _GID, gid)
 
 
 def gid_of(token: str) -> bytes:
-    """Return a 16-byte publisher identity. ROS compares it, never recomputes it: any hash of the token will do."""
+    """Return a 16-byte publisher identity. ROS compares it but never recomputes it: any hash of the token is valid."""
     return hashlib.blake2b(token.encode(), digest_size=_GID).digest()
 
 
@@ -61,10 +61,10 @@ def publisher_token(key: str, zid: str, node: str, entity_id: int) -> str:
 
 
 class RmwPublisher:
-    """Publisher as a ROS 2 node has it: with the attachment, and without Encoding, as rmw_zenoh sets none.
+    """Publisher like a ROS 2 node's: with the attachment and without Encoding, as rmw_zenoh sets none.
 
-    The identity in the attachment derives from ``token``, the publisher's liveliness token. ``now_ns`` is the wall
-    clock, nanoseconds, for the source time that ROS tools measure latency with.
+    The identity in the attachment derives from ``token``, the publisher's liveliness token. ``now_ns`` returns the
+    wall clock, nanoseconds: the source time from which ROS tools measure latency.
     """
 
     def __init__(self, inner: Publisher, token: str, now_ns: Callable[[], int]) -> None:
@@ -74,7 +74,7 @@ class RmwPublisher:
         self._sequence = 0
 
     def put(self, message: Encoded) -> None:
-        """Publish with the next sequence number; one thread at a time."""
+        """Publish with the next sequence number; on one thread at a time."""
         self._sequence += 1
         extra = attachment(self._sequence, self._now_ns(), self._gid)
         self._inner.put(Encoded(message.payload, "", extra))

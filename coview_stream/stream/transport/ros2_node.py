@@ -1,4 +1,4 @@
-"""Start of a ROS 2 node through rclpy, its parameters as settings, its types and QoS."""
+"""Start of a ROS 2 node with rclpy, its parameters as settings, its types and QoS."""
 
 from __future__ import annotations
 
@@ -16,10 +16,10 @@ _OWN_PARAMETERS = ("use_sim_time", "start_type_description_service")
 
 
 def start_node(args: Sequence[str]) -> Any:
-    """Return a ROS 2 node in a context of its own; ``args`` are those behind ``--ros-args``.
+    """Return a ROS 2 node in its own context; ``args`` are the arguments after ``--ros-args``.
 
     Raises:
-        DependencyError: there is no rclpy, or one of another Python. ConfigError: it refuses the arguments.
+        DependencyError: rclpy is missing, or built for another Python. ConfigError: it refuses the arguments.
     """
     rclpy = _import_rclpy()
     context = rclpy.context.Context()
@@ -27,7 +27,7 @@ def start_node(args: Sequence[str]) -> Any:
         signals = import_module("rclpy.signals").SignalHandlerOptions.NO  # the command ends the node
         rclpy.init(args=["--ros-args", *args], context=context, signal_handler_options=signals)
         return rclpy.node.Node(_NODE, context=context, automatically_declare_parameters_from_overrides=True)
-    except Exception as error:  # its own kinds differ from release to release
+    except Exception as error:  # its exception types differ between releases
         raise ConfigError(f"--ros-args {' '.join(args)}: {printable(error)}") from error
 
 
@@ -53,10 +53,10 @@ def _import_rclpy() -> Any:
 
 
 def settings_of(node: Any) -> dict[str, Any]:
-    """Return the parameters of a node that are not its own, those with dots as tables.
+    """Return a node's parameters, except its own; those with dots as tables.
 
     Raises:
-        ConfigError: a name is that of a value and of a table.
+        ConfigError: a name is used for both a value and a table.
     """
     settings: dict[str, Any] = {}
     for name, parameter in sorted(node.get_parameters_by_prefix("").items()):
@@ -74,7 +74,7 @@ def settings_of(node: Any) -> dict[str, Any]:
 
 
 def latched(depth: int) -> Any:
-    """Return a QoS that delivers the newest ``depth`` messages to later subscribers as well."""
+    """Return a QoS that also delivers the newest ``depth`` messages to later subscribers."""
     qos = import_module("rclpy.qos")
     return qos.QoSProfile(depth=depth, durability=qos.DurabilityPolicy.TRANSIENT_LOCAL)
 

@@ -1,7 +1,7 @@
-"""A ROS 2 node as a transport: topics instead of zenoh's keys, through rclpy, which nothing else imports.
+"""A ROS 2 node as a transport: topics instead of zenoh keys, through rclpy.
 
-Clouds, odometry and initial poses come as the bytes that the middleware has, and are read by our own codec. Poses,
-statuses and the view of the map go out as the messages that RViz and Nav2 read; all else stays in this process.
+Clouds, odometry and initial poses are read by our own codec from the middleware's bytes. Poses, statuses and the map
+view are published as the messages that RViz and Nav2 read; everything else stays in this process.
 """
 
 from __future__ import annotations
@@ -38,35 +38,35 @@ from coview_stream.stream.transport.zenoh_io import THREADS, Inbox, Inboxes
 _log = logging.getLogger(__name__)
 
 _QUEUE = 1024  # samples; 5 s of 200 Hz odometry
-_CACHE = 10.0  # seconds of transforms that a tf2 buffer keeps: with older stamps no user of ours finds any
+_CACHE = 10.0  # seconds of transforms in a tf2 buffer: older stamps find none
 _JOIN = 0.3  # seconds for each thread at closing
-RETRY = 10.0  # seconds until a view of the map that could not be made is asked for again
+RETRY = 10.0  # seconds until a map view that failed is requested again
 _NO_TF = "as ROS package tf2_msgs is missing"
 _MAP_TOPIC, _GUESS_TOPIC = "map_points", "initialpose"  # relative: a namespace moves them
 
 
 @dataclass
 class _Robot:
-    """A robot's topics and frames. ``check_frames``: clouds have to be in the frame whose odometry comes."""
+    """A robot's topics and frames. ``check_frames``: clouds must be in the frame of the odometry's body."""
 
     keys: RobotKeys
-    prefix: str  # of the topics that a single robot has in the node's namespace
+    prefix: str  # of topics that a single robot has in the node's namespace; empty with one robot
     check_frames: bool
     map_frame: str = "map"
     odometry_frame: str = ""  # of the newest odometry
-    body_frame: str = ""  # whose odometry it is
-    frames: FrameTree = field(default_factory=FrameTree)  # of /tf_static
-    T_map_odom: Pose | None = None  # of the newest pose; kept while there is none
+    body_frame: str = ""  # the frame that odometry locates
+    frames: FrameTree = field(default_factory=FrameTree)  # from /tf_static
+    T_map_odom: Pose | None = None  # of the newest pose; kept while there is no pose
     posed_at: float = 0.0  # local time of the newest pose
     heard_ns: int | None = None  # stamp of the last cloud or odometry
-    odometry_ns: int | None = None  # newest of odometry's stamps since its clock began
-    restarts: int = 0  # of odometry's frame, by the node
-    clock_said: bool = False  # that the stamps contradict this node's clock
+    odometry_ns: int | None = None  # newest odometry stamp since its clock started
+    restarts: int = 0  # of odometry's frame, counted by the node
+    clock_said: bool = False  # whether a log line says that the stamps contradict this node's clock
     outputs: dict[str, Any] = field(default_factory=dict)  # rclpy's publishers
-    lock: threading.Lock = field(default_factory=threading.Lock)  # of ``T_map_odom`` with ``odometry_ns``
+    lock: threading.Lock = field(default_factory=threading.Lock)  # guards ``T_map_odom`` with ``odometry_ns``
 
     def check_cloud(self, sample: Sample) -> Sample:
-        """Return a cloud with its mount, of /tf_static, or refused for its frame."""
+        """Return a cloud with its mount from /tf_static, or refused because of its frame."""
         self.heard_ns, frame = ros2.header_stamp(sample.payload), ros2.frame_id(sample.payload)
         self.frames.lidar = frame
         body = self.body_frame or self.frames.body()  # odometry may name no body
@@ -84,7 +84,7 @@ class _Robot:
         )
 
     def check_odometry(self, sample: Sample) -> Sample:
-        """Note the frames of odometry; refuse that of another localizer."""
+        """Note the frames of odometry; refuse odometry from another localizer."""
         frame, stamp_ns = ros2.frame_id(sample.payload), ros2.header_stamp(sample.payload)
         if frame == self.map_frame:
             return _refused(sample, f"odometry in frame {frame!r}, which is the map's: is it another localizer's pose?")
@@ -95,14 +95,14 @@ class _Robot:
         return sample
 
     def note_restarts(self, count: int) -> None:
-        """Forget map -> odom where the node has found that odometry's frame began anew."""
+        """Forget map -> odom if the node has found that odometry's frame restarted."""
         with self.lock:
             if count > self.restarts:
                 self.T_map_odom, self.odometry_ns = None, self.heard_ns
             self.restarts = count
 
     def clock(self, now_ns: int) -> str:
-        """Return how the stamps contradict the node's clock; empty if they do not."""
+        """Return how the stamps contradict the node's clock; empty if they agree."""
         if self.heard_ns is None:
             return ""
         if not now_ns:
@@ -123,11 +123,11 @@ class _Input:
     topic: str
     kind: str
     check: Callable[[Sample], Sample] = lambda sample: sample
-    then: Callable[[], None] = lambda: None  # after it has been handed on
+    then: Callable[[], None] = lambda: None  # called after the sample has been delivered
 
 
 class _Output:
-    """Publisher to this process, and by ``write`` to ROS."""
+    """Publisher to this process and, through ``write``, to ROS."""
 
     def __init__(self, transport: Ros2Transport, key: str, write: Callable[[bytes], None] | None) -> None:
         self._transport = transport
@@ -145,12 +145,12 @@ class _Output:
 
 
 class Ros2Transport:
-    """A ROS 2 node's topics under the keys of its robots; all methods may be called from any thread.
+    """A ROS 2 node's topics under the keys of its robots; any thread may call any method.
 
     Args:
-        node: from :func:`~coview_stream.stream.transport.ros2_node.start_node`; it is destroyed at closing.
-        keys: of the robots; clouds, odometry and poses are topics without their first slash.
-        check_frames: refuse clouds in a frame that nothing joins to the one whose odometry comes.
+        node: from :func:`~coview_stream.stream.transport.ros2_node.start_node`; :meth:`close` destroys it.
+        keys: of the robots; clouds, odometry and poses are topics without the leading slash.
+        check_frames: refuse clouds in a frame that no transform joins to that of the odometry's body.
     """
 
     def __init__(self, node: Any, keys: Sequence[RobotKeys], check_frames: bool = True) -> None:
@@ -163,7 +163,7 @@ class Ros2Transport:
         self._services: dict[str, str] = {}
         self._show_map: Callable[[], dict[str, Any]] | None = None
         self._map_publisher: Any = None
-        self._shown = ""  # hash of the map that has been published
+        self._shown = ""  # hash of the published map
         self._retry_at = 0.0  # local time
         self._lock = threading.RLock()
         self.closed = threading.Event()
@@ -187,7 +187,7 @@ class Ros2Transport:
         self._threads = [threading.Thread(target=work, name="coview ros", daemon=True) for work in works]
         for thread in self._threads:
             thread.start()
-        atexit.register(self.close)  # a thread inside rclpy while the interpreter shuts down may abort the process
+        atexit.register(self.close)  # a thread inside rclpy at interpreter shutdown may abort the process
 
     def _declare(self, robot: _Robot) -> None:
         """Declare a robot's topics."""
@@ -215,10 +215,10 @@ class Ros2Transport:
     def _create_publisher(self, kind: str, topic: str, depth: Any = 10) -> Any:
         return self._node.create_publisher(message_type(kind), topic, depth)
 
-    # ---- as of Transport
+    # ---- interface of Transport
 
     def subscribe(self, key: str, handler: Callable[[Sample], None], policy: Policy) -> Callable[[], None]:
-        """As :meth:`Transport.subscribe`, to a robot's topic or to messages of this process."""
+        """As :meth:`Transport.subscribe`, for a robot's topic or for messages of this process."""
         inbox = self._inboxes.open(key, handler, 1 if policy == "newest" else _QUEUE)
 
         def end() -> None:
@@ -239,14 +239,14 @@ class Ros2Transport:
         return end
 
     def _subscription(self, key: str, source: _Input) -> Any:
-        """Subscribe with the QoS of sensor data, which hears every publisher; bytes, not Python's objects."""
+        """Subscribe with the sensor-data QoS, which is compatible with every publisher; bytes, not Python objects."""
         qos = import_module("rclpy.qos")
         encoding = f"application/cdr;{source.kind}"
 
         def take(payload: bytes) -> None:
             with self.guard.catch(key):
                 sample = Sample(key, payload, encoding)
-                with contextlib.suppress(MessageError):  # of one without a header, which its codec will refuse
+                with contextlib.suppress(MessageError):  # without a header its codec will refuse it
                     sample = source.check(sample)
                 self.deliver(sample)
                 if not sample.refused:
@@ -259,7 +259,7 @@ class Ros2Transport:
         return subscription
 
     def deliver(self, sample: Sample) -> None:
-        """Hand a sample to the subscriptions of its key in this process."""
+        """Hand a sample to this process's subscriptions to its key."""
         for inbox in self._readers.get(sample.key, ()):
             inbox.put(sample)
 
@@ -268,7 +268,7 @@ class Ros2Transport:
         return _Output(self, key, self._writers.get(key))
 
     def answer(self, key: str, handler: Callable[[dict[str, str]], dict[str, Any]]) -> Callable[[], None]:
-        """Publish the view of the map; answer services where ``std_srvs`` is installed; ignore other questions."""
+        """Publish the map view; answer services if ``std_srvs`` is installed; ignore other queries."""
         if any(key == robot.keys.map_view for robot in self._robots):
             self._show_map = lambda: handler({})
         if key not in self._services or find_spec("std_srvs") is None:
@@ -306,7 +306,7 @@ class Ros2Transport:
         return []
 
     def await_subscriber(self, key: str, seconds: float, wait: Callable[[float], object] = time.sleep) -> bool:
-        """As :meth:`Transport.await_subscriber`, of a topic ``key``."""
+        """As :meth:`Transport.await_subscriber`, for topic ``key``."""
         deadline = time.monotonic() + seconds
         while not self._node.count_subscribers(f"/{key}"):
             if time.monotonic() >= deadline or wait(0.05):
@@ -314,7 +314,7 @@ class Ros2Transport:
         return True
 
     def connection(self) -> Connection:
-        """Return the ROS nodes that publish clouds and odometry, and log those with another type."""
+        """Return the ROS nodes that publish clouds and odometry; log publishers of another type."""
         names = set()
         with self._lock:
             subscribed = [(self._inputs[key], held.topic_name) for key, held in self._subscribed.items()]
@@ -322,7 +322,7 @@ class Ros2Transport:
             if source.topic.endswith(_GUESS_TOPIC):
                 continue
             for end in self._node.get_publishers_info_by_topic(topic):
-                if "UNKNOWN" in end.node_name:  # for the moment in which only the publisher is known
+                if "UNKNOWN" in end.node_name:  # briefly only the publisher is known, not its node
                     continue
                 names.add(f"{end.node_namespace.rstrip('/')}/{end.node_name}")
                 if end.topic_type != source.kind:
@@ -338,7 +338,7 @@ class Ros2Transport:
             self.closed.set()
         atexit.unregister(self.close)
         self._inboxes.end()
-        with contextlib.suppress(Exception):  # rclpy's own kinds, while it takes down the rest
+        with contextlib.suppress(Exception):  # rclpy's own exceptions while it shuts down
             self._executor.shutdown(_JOIN)
         for thread in self._threads:
             if thread is not threading.current_thread():
@@ -364,16 +364,16 @@ class Ros2Transport:
         with robot.lock:
             if robot.odometry_ns is not None:
                 if pose.stamp_ns > robot.odometry_ns:
-                    return  # of before the sender began anew
-                robot.odometry_ns = pose.stamp_ns  # a stray stamp far ahead is forgotten
+                    return  # from before the sender restarted
+                robot.odometry_ns = pose.stamp_ns  # forgets a stray stamp far ahead
             robot.T_map_odom, robot.map_frame, robot.posed_at = pose.T_map_odom, pose.frame_id, time.monotonic()
         robot.outputs["pose"].publish(ros2.encode_pose(pose).payload)
 
     def _broadcast(self, robot: _Robot) -> None:
-        """Broadcast map -> odom as it is known at the stamp of odometry that came; while the place is lost, as it was.
+        """Broadcast map -> odom at the stamp of new odometry; while the place is lost, the last known transform.
 
-        With odometry, not with poses: a lookup of the body at odometry's stamp then does not wait for the next pose.
-        But not at a stamp from before the newest: of a late sample, or of a clock that may have begun anew.
+        With odometry, not with poses: then a lookup of the body at odometry's stamp does not wait for the next pose.
+        Never at a stamp before the newest, which comes from a late sample or perhaps a restarted clock.
         """
         publisher, T, frame, stamp_ns = robot.outputs.get("tf"), robot.T_map_odom, robot.odometry_frame, robot.heard_ns
         if publisher is not None and T is not None and frame and stamp_ns is not None and stamp_ns == robot.odometry_ns:
@@ -399,13 +399,13 @@ class Ros2Transport:
         self._diagnostics.publish(ros2_outputs.encode_diagnostics(status, now_ns, transform, clock))
 
     def _publish_map(self) -> None:
-        """Publish the points of the map that is served, to later subscribers too, unless they have been published."""
+        """Publish the served map's points, latched for later subscribers, unless they have been published."""
         if self._show_map is None:
             return
         self._retry_at = time.monotonic() + RETRY
         answer = self._show_map()
         self._retry_at = 0.0
-        if answer["map_sha256"] == self._shown:  # a robot is on another map as yet
+        if answer["map_sha256"] == self._shown:  # a robot is still on another map
             return
         view = MapView.from_json(answer)
         if self._map_publisher is None:

@@ -1,4 +1,4 @@
-"""Interface of a network for nodes and clients; zenoh implements it, and an in-memory transport for tests."""
+"""Network interface of nodes and clients; zenoh implements it, and an in-memory transport for tests."""
 
 from __future__ import annotations
 
@@ -10,22 +10,22 @@ from typing import Any, Literal, Protocol
 from coview_stream.messages.types import Encoded, Sample
 
 MAX_REPLY = 64 * 1024
-"""Bytes of a reply to a query, unless the caller allows more."""
+"""Largest reply to a query, bytes, unless the caller allows more."""
 
 Policy = Literal["newest", "all"]
 """``newest``: a slow reader sees only the newest sample (a ring of one). ``all``: every sample, in order."""
 
 Urgency = Literal["realtime", "data", "report", "bulk"]
-"""``realtime``: small and urgent (poses): express, never waits. ``data``: must arrive (odometry): blocks rather than
-drops. ``report``: statuses: a reader that has stopped misses some and blocks no other. ``bulk``: clouds: the newest
-frame matters, one that does not fit is dropped."""
+"""``realtime``: small and urgent (poses): express, never waits. ``data``: must arrive (odometry): blocks, never drops.
+``report``: statuses: a stopped reader misses some and blocks no other reader. ``bulk``: clouds: only the newest frame
+matters, one that does not fit is dropped."""
 
 
 class Publisher(Protocol):
     """A publisher on one key."""
 
     def put(self, message: Encoded) -> None:
-        """Publish; never raises for a peer that is gone."""
+        """Publish; never raises for a peer that has gone."""
         ...
 
     def close(self) -> None:
@@ -35,7 +35,7 @@ class Publisher(Protocol):
 
 @dataclass(frozen=True)
 class Connection:
-    """Zenoh identities that a transport is connected to, sorted."""
+    """Zenoh identities of the connected routers and peers, sorted."""
 
     routers: tuple[str, ...] = ()
     peers: tuple[str, ...] = ()  # all others; clients of a listening session count as peers
@@ -43,10 +43,10 @@ class Connection:
 
 
 class Transport(Protocol):
-    """A publish/subscribe session. Handlers are called on a thread of the subscription's own, one call at a time."""
+    """A publish/subscribe session. Each subscription calls its handler for one sample at a time, on another thread."""
 
     def subscribe(self, key: str, handler: Callable[[Sample], None], policy: Policy) -> Callable[[], None]:
-        """Call ``handler`` with samples on ``key`` (a key expression). Its errors are logged.
+        """Call ``handler`` with samples on ``key`` (a key expression). Its exceptions are logged.
 
         Returns a function that ends the subscription; any thread may call it, more than once.
         """
@@ -57,7 +57,7 @@ class Transport(Protocol):
         ...
 
     def answer(self, key: str, handler: Callable[[dict[str, str]], dict[str, Any]]) -> Callable[[], None]:
-        """Answer queries on ``key`` with JSON; the handler takes the query's parameters. An error of it is replied.
+        """Answer queries on ``key`` with JSON; the handler takes the query's parameters. Its exceptions are replied.
 
         Returns a function that ends the answers; any thread may call it, more than once.
         """
@@ -73,22 +73,22 @@ class Transport(Protocol):
         """Query ``key`` and return the first JSON reply, of at most ``max_bytes``.
 
         Raises:
-            TransportError: no answer within ``timeout`` seconds, or one that is an error or no JSON object.
+            TransportError: no answer within ``timeout`` seconds, or the answer is an error or not a JSON object.
         """
         ...
 
     def tokens(self, expression: str) -> list[str]:
-        """List the liveliness tokens that match ``expression`` right now, sorted; none while not connected.
+        """List the liveliness tokens that match ``expression`` now, sorted; empty while not connected.
 
         Raises:
-            TransportError: they cannot be asked for.
+            TransportError: the query for tokens failed.
         """
         ...
 
     def await_subscriber(self, key: str, seconds: float, wait: Callable[[float], object] = time.sleep) -> bool:
-        """Wait up to ``seconds`` for a subscriber to ``key``; False if there is none by then.
+        """Wait up to ``seconds`` for a subscriber to ``key``; return whether there is one.
 
-        ``wait(seconds)`` passes the time between two looks; a true return value of it ends the waiting early.
+        ``wait(seconds)`` passes the time between checks; it ends the wait early by returning True.
         """
         ...
 

@@ -1,4 +1,4 @@
-"""Configuration of a zenoh session: the user's file first, our defaults where it sets nothing.
+"""Configuration of a zenoh session: the user's file first, our defaults for settings that it leaves out.
 
 zenoh's errors become one short line that ends with the remedy.
 """
@@ -21,25 +21,25 @@ _WITH_PORT = ("tcp", "udp", "tls", "quic", "ws")
 _HOST_PORT = re.compile(r"(\[[^\]]+\]|[^:\[\]]+):(\d+)")
 
 _DEFAULTS: dict[str, Any] = {
-    # explicit endpoints only: a robot must not join sessions that others test on the same network
+    # explicit endpoints only: a robot must not join sessions of others who test on the same network
     "scouting/multicast/enabled": False,
     "scouting/gossip/autoconnect": {"router": [], "peer": [], "client": []},
-    # zenoh's own waits grow to 4 s; a robot that stands still for want of poses needs its router back within 2 s
+    # zenoh's own retry period grows to 4 s; a robot that stops without poses needs its router back within 2 s
     "connect/retry": {"period_init_ms": 250, "period_max_ms": 1000, "period_increase_factor": 2.0},
-    # a host that is off does not refuse: each attempt waits this long, and so, at worst, does the end of the process.
-    # Enough for five round trips over a satellite. connect/timeout_ms would bound the wait too, but with it a client
-    # never tries its second endpoint (zenoh#1602)
+    # a host that is off does not refuse: each attempt, and at worst the end of the process, waits this long. It is
+    # enough for five satellite round trips. connect/timeout_ms would bound the wait too, but with it a client never
+    # tries its second endpoint (zenoh#1602)
     "transport/unicast/open_timeout": 3000,
-    # poses are express, a batch each, and dropped after a millisecond without a free one: room for a fleet's at once
+    # poses are express: each takes a batch, and is dropped after a millisecond without a free one: room for a fleet
     "transport/link/tx/queue/size/real_time": 16,
-    # the system's buffer, in bytes, which knows no priorities: left alone it grows to 4 MB, and on a thin link odometry
-    # waits behind the clouds in it. With half of this the throughput on one machine fell to a third at times
+    # the kernel's send buffer, bytes, has no priorities: by default it grows to 4 MB, and on a thin link odometry waits
+    # behind the clouds in it. At half this size the throughput on one machine fell to a third at times
     "transport/link/tcp/so_sndbuf": 131072,
 }
 
-# zenoh switches shared memory on by itself. It saves 0.5 ms of 1.5 ms on a 1 MB cloud between processes of one machine,
-# and costs: messages lost without a word when the receiver stalls for 100 ms (zenoh#2628), segments left behind by
-# killed processes (zenoh#2571), and an error line where memory locking is limited, as it is for ordinary users.
+# zenoh enables shared memory by default. It saves 0.5 ms of 1.5 ms for a 1 MB cloud between processes on one machine,
+# but loses messages silently when the receiver stalls for 100 ms (zenoh#2628), leaves segments of killed processes
+# behind (zenoh#2571), and logs an error where memory locking is limited, as for ordinary users.
 _SHARED_MEMORY = "transport/shared_memory/enabled"
 
 _COMMENT = re.compile(r"//[^\n]*|/\*.*?\*/", re.S)
@@ -49,7 +49,7 @@ _FILES = (
     *("transport/link/tls/connect_private_key", "transport/auth/usrpwd/dictionary_file"),
 )
 
-# zenoh's words
+# zenoh's error texts
 _REMEDIES = {
     "Address already in use": "another node or router holds the port: --connect to it, or another --listen",
     "Cannot assign requested address": "no address of this machine: --listen on one that it has, or --connect to the "
@@ -64,7 +64,7 @@ _PLACE = re.compile(r" at line (\d+) column \d+")
 
 @contextmanager
 def zenoh_errors(subject: str) -> Iterator[None]:
-    """Turn zenoh's errors, and the panics of its Rust core, into :class:`TransportError` about ``subject``."""
+    """Turn zenoh's errors, and panics in its Rust core, into :class:`TransportError` about ``subject``."""
     import zenoh
 
     try:
@@ -83,19 +83,19 @@ def compose(
 ) -> Any:  # fmt: skip
     """Build a ``zenoh.Config``.
 
-    Settings of the file have precedence over our defaults; ``connect`` and ``listen`` replace its endpoints. Without
-    a mode in the file we are a client if there is something to connect to and nothing to listen on, else a peer: two
-    peers do not see each other through a router, a client is seen by all.
+    The file's settings override our defaults; ``connect`` and ``listen`` replace its endpoints. If the file sets no
+    mode, we are a client if there is an endpoint to connect to and none to listen on, else a peer: two peers do not see
+    each other through a router, a client is seen by all.
 
     Args:
         connect: endpoints, for example ``tcp/10.0.0.1:7447``.
         listen: endpoints.
         path: a zenoh configuration, JSON5 or YAML.
-        lease_ms: how long others wait for a sign of life before they take us for dead; None leaves it at zenoh's 10 s.
-        max_message: bytes of a message beyond which zenoh receives no more of it; None leaves it at zenoh's 1 GiB.
+        lease_ms: time without a sign of life after which others consider us dead; None: zenoh's 10 s.
+        max_message: bytes after which zenoh stops receiving a message; None: zenoh's 1 GiB.
 
     Raises:
-        TransportError: if the file cannot be read, is no zenoh configuration, names a missing file, or an endpoint is
+        TransportError: the file cannot be read, is not a zenoh configuration or names a missing file, or an endpoint is
             malformed.
     """
     import zenoh
@@ -115,7 +115,7 @@ def compose(
             config = zenoh.Config.from_file(str(path))
     defaults = zenoh.Config()
 
-    def is_unset(key: str) -> bool:  # zenoh does not list a file's settings; a value equal to the default counts
+    def is_unset(key: str) -> bool:  # zenoh does not list a file's settings; the default value counts as unset
         return bool(_get(config, key) == _get(defaults, key))
 
     if connect:
@@ -123,7 +123,7 @@ def compose(
     if listen:
         _insert(config, "listen/endpoints", list(listen))
     elif mode_of(config) != "router" and is_unset("listen/endpoints"):
-        _insert(config, "listen/endpoints", [])  # unset, a peer would listen on all interfaces
+        _insert(config, "listen/endpoints", [])  # if unset, a peer would listen on all interfaces
     if _get(config, "mode") is None:
         has_listen, has_connect = (bool(_get(config, "listen/endpoints")), bool(_get(config, "connect/endpoints")))
         _insert(config, "mode", "client" if has_connect and not has_listen else "peer")
@@ -134,7 +134,7 @@ def compose(
         _insert(config, "transport/link/tx/lease", lease_ms)
     if max_message is not None and "max_message_size" not in text:
         _insert(config, "transport/link/rx/max_message_size", max_message)
-    if "shared_memory" not in text:  # set or not, it reads the same: ask the file's text
+    if "shared_memory" not in text:  # reads the same whether set or not: check the file's text
         _insert(config, _SHARED_MEMORY, False)
     if _get(config, "transport/unicast/lowlatency"):
         raise TransportError(
@@ -142,7 +142,7 @@ def compose(
         )
     for key in _FILES:
         name = _get(config, key)
-        if name is not None and not Path(name).is_file():  # zenoh would retry for ever without a word
+        if name is not None and not Path(name).is_file():  # zenoh would retry for ever without an error
             raise TransportError(f"zenoh configuration {path}: {key} names {name}, which is no file")
     return config
 
@@ -172,7 +172,7 @@ def _check_endpoint(endpoint: str, option: str) -> None:
         found = _HOST_PORT.fullmatch(address)
         if not found:
             raise TransportError(f"{option} {endpoint!r}: {address!r} is not <host>:<port>, such as 127.0.0.1:7447")
-        min_port = 0 if option == "--listen" else 1  # listening on 0 takes any that is free
+        min_port = 0 if option == "--listen" else 1  # listening on 0 takes any free port
         if not min_port <= int(found.group(2)) <= 65535:
             raise TransportError(f"{option} {endpoint!r}: port must be 1..65535, such as 7447")
 
@@ -187,7 +187,7 @@ def _insert(config: Any, key: str, value: Any) -> None:
 
 
 def reason(error: BaseException) -> str:
-    """Return zenoh's message on one line, without the lines of its source, with a remedy where we know one."""
+    """Return zenoh's message on one line, without Rust source lines, and with any remedy we know."""
     text = re.sub(r" at \S+\.rs:\d+\.?", "", " ".join(str(error).split()))
     text = _shortened(text.strip()) or type(error).__name__
     for cause, remedy in _REMEDIES.items():
@@ -197,7 +197,7 @@ def reason(error: BaseException) -> str:
 
 
 def _shortened(text: str) -> str:
-    """Shorten an error about a configuration file, which lists all keys that there could have been."""
+    """Shorten an error about a configuration file, which lists all valid keys."""
     line = ""
     if syntax := _SYNTAX.match(text):
         return f"line {syntax[1]}, column {syntax[2]}: {syntax[3]}"

@@ -1,4 +1,4 @@
-"""Samples and queries between zenoh's types and ours, and their quality of service."""
+"""Conversion of samples and queries between zenoh's types and ours, and their quality of service."""
 
 from __future__ import annotations
 
@@ -17,23 +17,23 @@ from coview_stream.stream.transport.transport import Urgency
 
 _UNSET = "zenoh/bytes"  # how zenoh spells "no encoding"
 _JSON = "application/json"
-_MAX_WAITING = 1024  # messages that wait for the link: 5 s of 200 Hz odometry
+_MAX_WAITING = 1024  # messages queued for the link: 5 s of 200 Hz odometry
 MAX_QUERY = 8192
-"""Bytes of a query's parameters, payload and attachment; no answer of ours reads the last two."""
+"""Largest query, bytes of parameters, payload and attachment; our answers ignore the last two."""
 
 MAX_QUERIES = 16
-"""Queries that wait on one key; the next ones are refused."""
+"""Queries that may wait on one key; further ones are refused."""
 
-FLUSH = 0.3  # seconds for them at closing
+FLUSH = 0.3  # seconds for queued messages at close
 
 Answer = Callable[[dict[str, str]], dict[str, Any]]
-"""Handler of a query: from its parameters to the fields of the reply."""
+"""Handler of a query: takes its parameters, returns the fields of the reply."""
 
 
 class ZenohPublisher:
-    """A publisher that may exist before the session does, and outlive it.
+    """A publisher that may exist before its session, and outlive it.
 
-    ``guard`` logs zenoh's refusals; ``writer`` publishes in its own time, None on the thread that calls.
+    ``guard`` logs zenoh's refusals; ``writer`` publishes asynchronously, None on the calling thread.
     """
 
     def __init__(self, key: str, guard: RateLimitedErrors, writer: Writer | None = None) -> None:
@@ -44,20 +44,20 @@ class ZenohPublisher:
         self._closed = False
 
     def attach(self, publisher: Any) -> None:
-        """Take zenoh's publisher, once there is a session to declare it on; None when that session ends."""
+        """Take zenoh's publisher, once a session has declared it; None when that session ends."""
         self._publisher = publisher
         if self._closed:
             self.close()
 
     def put(self, message: Encoded) -> None:
-        """Publish; lost while there is no session yet or no peer."""
+        """Publish; the message is lost without a session or peer."""
         if self._writer is None:
             self.write(message)
         elif self._publisher is not None:
             self._writer.put(self, message)
 
     def write(self, message: Encoded) -> None:
-        """Publish now, for as long as the link holds that up."""
+        """Publish now, and wait while the link is blocked."""
         publisher = self._publisher
         if publisher is not None and not self._closed:
             encoding = message.encoding or _UNSET
@@ -65,7 +65,7 @@ class ZenohPublisher:
                 publisher.put(message.payload, encoding=encoding, attachment=message.attachment)
 
     def close(self) -> None:
-        """Undeclare; later messages are ignored. What waits for the link is given 0.3 s."""
+        """Undeclare; later messages are ignored. Messages queued for the link get 0.3 s."""
         if self._writer is not None and not self._closed:
             self._writer.flush(FLUSH)
         self._closed = True
@@ -76,10 +76,10 @@ class ZenohPublisher:
 
 
 class Writer:
-    """Queue of messages that wait for the link rather than being dropped, and the work of the thread that empties it.
+    """Queue of messages that wait for the link instead of being dropped, and the work of the thread that empties it.
 
-    A link that is half-open holds up its writer by seconds: the thread, not its callers. Of more than 1024
-    messages the oldest are dropped, five seconds of odometry at 200 Hz, and that is logged.
+    A half-open link blocks its writer for seconds: this thread, not the callers. Beyond 1024 messages, five seconds of
+    200 Hz odometry, the oldest are dropped, which is logged.
     """
 
     def __init__(self, guard: RateLimitedErrors) -> None:
@@ -114,7 +114,7 @@ class Writer:
             publisher.write(message)
 
     def flush(self, seconds: float) -> bool:
-        """Wait until all is written, ``seconds`` at most; tell whether it is."""
+        """Wait up to ``seconds`` until everything is written; return whether it is."""
         with self._changed:
             return self._changed.wait_for(lambda: not (self._waiting or self._busy), seconds)
 
@@ -127,10 +127,10 @@ class Writer:
 
 
 def plain(sample: Any, max_payload: int | None = None) -> Sample:
-    """Return a zenoh sample as plain data. Copies the payload once: zenoh's Python types share no memory.
+    """Return a zenoh sample as plain data. Copies the payload once: zenoh's Python types do not share memory.
 
-    Of payload and attachment that are together larger than ``max_payload`` only the size is returned: copying them
-    would block every other thread.
+    If payload and attachment together exceed ``max_payload``, only their size is returned: a copy would block every
+    other thread.
     """
     key, encoding = str(sample.key_expr), str(sample.encoding)
     encoding = "" if encoding == _UNSET else encoding
@@ -141,26 +141,26 @@ def plain(sample: Any, max_payload: int | None = None) -> Sample:
 
 
 def quality(urgency: Urgency) -> dict[str, Any]:
-    """Return the options to declare a publisher with."""
+    """Return the options for declaring a publisher."""
     import zenoh
 
     congestion, priority = zenoh.CongestionControl, zenoh.Priority
-    if urgency == "realtime":  # express: not batched; 0.2 ms beside clouds on the same link instead of 8
+    if urgency == "realtime":  # express: not batched; 0.2 ms instead of 8 beside clouds on the link
         return {"express": True, "priority": priority.REAL_TIME, "congestion_control": congestion.DROP}
     if urgency == "report":
         return {"congestion_control": congestion.DROP}
-    if urgency == "data":  # DROP lost 2 % of small messages at 300 robots on one link; before clouds on a thin one
+    if urgency == "data":  # DROP lost 2 % of small messages at 300 robots on one link; goes before clouds on a thin one
         return {"priority": priority.INTERACTIVE_HIGH, "congestion_control": congestion.BLOCK}
-    # BLOCK_FIRST hands one frame to a background task and drops newer ones meanwhile: put never waits. DROP gives up a
-    # big frame half sent after 50 ms, so on a slow link none arrives
+    # BLOCK_FIRST hands one frame to a background task and meanwhile drops newer ones: put never waits. DROP abandons a
+    # half-sent large frame after 50 ms, so none arrives on a slow link
     control = getattr(congestion, "BLOCK_FIRST", congestion.DROP)
     return {"priority": priority.DATA_LOW, "congestion_control": control}
 
 
 class Answers:
-    """Queue of queries to answer, worked on by one thread for all keys.
+    """Queue of queries to answer; one thread answers for all keys.
 
-    At most :data:`MAX_QUERIES` wait on one key, of :data:`MAX_QUERY` bytes each: the others are refused at once.
+    At most :data:`MAX_QUERIES` of :data:`MAX_QUERY` bytes each wait on one key: further ones are refused at once.
     """
 
     def __init__(self, guard: RateLimitedErrors) -> None:
@@ -170,7 +170,7 @@ class Answers:
         self._lock = threading.Lock()
 
     def callback(self, key: str, handler: Answer, ended: threading.Event) -> Callable[[Any], None]:
-        """Return the callback for queries on ``key``: it puts them into the queue. Once ``ended`` none is answered."""
+        """Return the callback that queues queries on ``key``. Once ``ended`` is set none is answered."""
 
         def enqueue(query: Any) -> None:
             with self._guard.catch(key):
@@ -200,7 +200,7 @@ class Answers:
                     self._answer(key, query, handler)
             with self._lock:
                 self._waiting[key] -= 1
-            del entry, query  # a query is finished for its sender once no reference is left
+            del entry, query  # a query is complete for its sender once no reference is left
 
     def end(self) -> None:
         """Let :meth:`run` return."""
@@ -223,10 +223,10 @@ class Answers:
 def first_reply(
     session: Any, key: str, parameters: dict[str, str], timeout: float, max_bytes: int
 ) -> dict[str, Any] | None:
-    """Query ``key`` and return the first JSON reply, None without one within ``timeout`` seconds.
+    """Query ``key`` and return the first JSON reply; None if none comes within ``timeout`` seconds.
 
     Raises:
-        TransportError: the answer is an error, or no JSON object.
+        TransportError: the answer is an error or not a JSON object.
     """
     import zenoh
 
@@ -245,7 +245,7 @@ def _json_object(key: str, payload: bytes, max_bytes: int) -> dict[str, Any]:
 
 
 def _error_of(payload: bytes) -> str:
-    """Return the text of an error reply: the ``error`` of its JSON, or the bytes as text."""
+    """Return the text of an error reply: ``error`` in its JSON, or the bytes as text."""
     try:
         return str(read_object(payload)["error"])
     except (MessageError, KeyError):
@@ -253,22 +253,22 @@ def _error_of(payload: bytes) -> str:
 
 
 THREADS = 4
-"""Handlers that run at once, of different subscriptions: they decode and rarely wait."""
+"""Handlers that run in parallel, for different subscriptions: they decode and rarely wait."""
 
 
 MAX_INBOX = 1 << 27
-"""Bytes of the samples that wait on one subscription, the newest apart: two of the largest."""
+"""Bytes of samples that may wait on one subscription, besides the newest: two of the largest."""
 
 
 def size_of(sample: Any) -> int:
-    """Return the bytes of a zenoh sample's payload and attachment, without copying them."""
+    """Return the bytes in a zenoh sample's payload and attachment, without a copy."""
     return len(sample.payload) + (0 if sample.attachment is None else len(sample.attachment))
 
 
 class Inbox:
-    """Samples of one subscription; the oldest are dropped where they are too many, or too large together.
+    """Samples of one subscription; the oldest are dropped if they are too many, or too large together.
 
-    At most one is handled at a time.
+    One sample is handled at a time.
     """
 
     def __init__(self, name: str, handle: Callable[[Any], None], size: int, ready: SimpleQueue[Inbox | None]) -> None:
@@ -281,7 +281,7 @@ class Inbox:
         self._scheduled = self._closed = False
 
     def put(self, sample: Any) -> None:
-        """Keep a sample for its handler; called on zenoh's thread, and back at once."""
+        """Keep a sample for its handler; called on zenoh's thread, returns at once."""
         weight = size_of(sample)
         with self._lock:
             if self._closed:
@@ -295,14 +295,14 @@ class Inbox:
                 self._ready.put(self)
 
     def close(self) -> None:
-        """Handle nothing more; a running handler ends."""
+        """Handle nothing more; a running handler finishes."""
         with self._lock:
             self._closed = True
             self._waiting.clear()
             self._bytes = 0
 
     def work(self) -> None:
-        """Handle the oldest sample; the next one waits for its turn behind other subscriptions."""
+        """Handle the oldest sample; the next one queues behind other subscriptions."""
         with self._lock:
             sample, weight = self._waiting.popleft() if self._waiting else (None, 0)
             self._bytes -= weight
@@ -310,7 +310,7 @@ class Inbox:
             if sample is not None:
                 self._handle(sample)
         finally:
-            del sample  # it may be large, and must not live until the next one comes
+            del sample  # it may be large: free it before the next sample comes
             with self._lock:
                 self._scheduled = bool(self._waiting)
                 if self._scheduled:
@@ -329,7 +329,7 @@ class Inboxes:
         return Inbox(name, handle, size, self._ready)
 
     def run(self) -> None:
-        """Handle samples until :meth:`end`; on several threads at once."""
+        """Handle samples until :meth:`end`; several threads may run this."""
         while (inbox := self._ready.get()) is not None:
             with self._guard.catch(inbox.name):
                 inbox.work()
@@ -337,5 +337,5 @@ class Inboxes:
         self._ready.put(None)  # for the other threads
 
     def end(self) -> None:
-        """Let all :meth:`run` return."""
+        """Let every :meth:`run` return."""
         self._ready.put(None)

@@ -1,4 +1,4 @@
-"""Zenoh transport: a session behind the interface :class:`~coview_stream.stream.transport.transport.Transport`."""
+"""Zenoh transport: a session that implements :class:`~coview_stream.stream.transport.transport.Transport`."""
 
 from __future__ import annotations
 
@@ -31,17 +31,17 @@ from coview_stream.stream.transport.zenoh_io import (
 
 _log = logging.getLogger(__name__)
 
-# zenoh's words for a missing router; any other error at opening is a mistake that waiting does not mend
+# zenoh's error text for a missing router; waiting does not cure any other error at opening
 _NO_ROUTER = "Unable to connect"
 
 # seconds
-_POLL = 0.02  # a look at the matching status costs microseconds
-_RETRY = 0.5  # between two attempts to find the first router
-_OPEN_TIMEOUT = 2.0  # of opening, for the first attempt: a host that is off does not even refuse
-_CLOSE_TIMEOUT = 1.0  # of zenoh's own closing, which says goodbye on a link that may be held up
-_JOIN_TIMEOUT = 0.4  # for all our threads to end at close; they notice within 0.1
+_POLL = 0.02  # a check of the matching status costs microseconds
+_RETRY = 0.5  # between attempts to find the first router
+_OPEN_TIMEOUT = 2.0  # for the first attempt to open: a host that is off does not even refuse
+_CLOSE_TIMEOUT = 1.0  # for zenoh to close, which says goodbye on a link that may be blocked
+_JOIN_TIMEOUT = 0.4  # for all our threads to end at close; they notice it within 0.1
 _EXIT_TIMEOUT = 10.0  # for each thread to end with the process: longer than any attempt to open
-_TOKEN_TIMEOUT = 1.0  # for answers to a question for tokens
+_TOKEN_TIMEOUT = 1.0  # for answers to a query for tokens
 _QUEUE = 1024  # samples; 5 s of 200 Hz odometry
 
 
@@ -54,22 +54,22 @@ def open_transport(
 ) -> ZenohTransport:
     """Open a zenoh session.
 
-    As a client it may start before its router: declarations take effect once the router is there, and samples published
-    until then are lost. After an outage the connection is restored without further calls.
+    A client may start before its router: declarations take effect once the router is there; samples published before
+    are lost. After an outage the connection is restored without further calls.
 
     Args:
         connect: endpoints to connect to, for example ``tcp/127.0.0.1:7447``.
         listen: endpoints to listen on.
-        config: zenoh configuration file; it wins over our defaults, ``connect`` and ``listen`` win over it.
-        max_payload: of a larger message, in bytes, only the size is handed on; None takes in all.
-        lease_ms: how long others wait for a sign of life from this session; None leaves it at zenoh's 10 s.
+        config: zenoh configuration file; it overrides our defaults, ``connect`` and ``listen`` override it.
+        max_payload: bytes beyond which only a message's size is handed on; None: no limit.
+        lease_ms: time without a sign of life after which others consider us dead; None: zenoh's 10 s.
 
     Raises:
-        TransportError: if the configuration is wrong or an endpoint cannot be listened on.
+        TransportError: the configuration is wrong or an endpoint cannot be bound.
     """
     import zenoh
 
-    # RUST_LOG=zenoh=warn prints why a router refuses us; without it this is silent
+    # RUST_LOG=zenoh=warn prints why a router refuses us; by default zenoh is silent
     zenoh.try_init_log_from_env()  # type: ignore[no-untyped-call]  # zenoh gives it no types
     return ZenohTransport(zenoh_config.compose(connect, listen, config, lease_ms), max_payload)
 
@@ -83,7 +83,7 @@ def open_client(
     listen: str | Sequence[str] | None = None,
     config: str | Path | None = None,
 ) -> Transport:
-    """Open a zenoh session for a client: to :data:`DEFAULT_ENDPOINT` unless something else is given.
+    """Open a zenoh session for a client: to :data:`DEFAULT_ENDPOINT` unless the arguments say otherwise.
 
     Raises:
         TransportError: as :func:`coview_stream.stream.transport.zenoh_transport.open_transport`.
@@ -99,7 +99,7 @@ def _listed(endpoints: str | Sequence[str] | None) -> list[str]:
 
 
 class ZenohTransport:
-    """A zenoh session; made by :func:`open_transport`. All methods may be called from any thread."""
+    """A zenoh session, opened by :func:`open_transport`. Any thread may call any method."""
 
     def __init__(self, config: Any, max_payload: int | None = None) -> None:
         self._config = config
@@ -115,17 +115,17 @@ class ZenohTransport:
         self._inboxes = Inboxes(self._guard)
         self._writer = Writer(self._guard)
         self._session: Any = None
-        # a thread inside zenoh while the interpreter shuts down aborts the process: end them all before
+        # a thread inside zenoh at interpreter shutdown aborts the process: end all threads before
         atexit.register(self._at_exit)
         self._open()
 
     def subscribe(self, key: str, handler: Callable[[Sample], None], policy: Policy) -> Callable[[], None]:
         """Call ``handler`` on one of our threads; ``newest`` keeps one unread sample, ``all`` the newest 1024.
 
-        Samples of a subscription are handled one at a time, in order. Returns a function that ends the subscription.
+        A subscription's samples are handled one at a time, in order. Returns a function that ends the subscription.
 
         Raises:
-            TransportError: if ``key`` is no key expression or the transport is closed.
+            TransportError: ``key`` is not a key expression, or the transport is closed.
         """
         import zenoh
 
@@ -157,7 +157,7 @@ class ZenohTransport:
     def answer(self, key: str, handler: Callable[[dict[str, str]], dict[str, Any]]) -> Callable[[], None]:
         """Answer queries with JSON; all handlers of a transport share one thread. Errors as in :meth:`subscribe`.
 
-        Returns a function that ends the answers, also to queries that wait.
+        Returns a function that ends the answers, also to waiting queries.
         """
         import zenoh
 
@@ -182,7 +182,7 @@ class ZenohTransport:
     def query(
         self, key: str, parameters: dict[str, str] | None = None, timeout: float = 5.0, max_bytes: int = MAX_REPLY
     ) -> dict[str, Any]:
-        """As :meth:`Transport.query`, after waiting for the first router if need be."""
+        """As :meth:`Transport.query`, but first waits for the first router."""
         deadline = time.monotonic() + timeout
         while (session := self._session) is None and time.monotonic() < deadline:
             time.sleep(_POLL)
@@ -236,9 +236,9 @@ class ZenohTransport:
         )
 
     def close(self) -> None:
-        """Undeclare everything and end the threads; takes well under a second, on a link that is held up up to two.
+        """Undeclare everything and end the threads; takes well under a second, on a blocked link up to two.
 
-        Messages that wait for the link are given 0.3 s. Idempotent.
+        Messages queued for the link get 0.3 s. Idempotent.
         """
         with self._lock:
             if self._closing.is_set():
@@ -250,7 +250,7 @@ class ZenohTransport:
             self._writer.flush(FLUSH)
             self._writer.end()
             self._start_once("closing", self._end, 1, session)
-            self._threads[-1].join(_CLOSE_TIMEOUT)  # a link that is held up keeps it from closing: go on without
+            self._threads[-1].join(_CLOSE_TIMEOUT)  # a blocked link keeps it from closing: continue without it
         self._writer.end()
         self._answers.end()
         self._inboxes.end()
@@ -274,7 +274,7 @@ class ZenohTransport:
     # opening
 
     def _open(self) -> None:
-        """Open now, so that a wrong configuration is the caller's error; a missing router is only waited for."""
+        """Open now, so that the caller gets configuration errors; a missing router is waited for in the background."""
         if not self._waits:
             try:
                 self._attempt()
@@ -326,7 +326,7 @@ class ZenohTransport:
         import zenoh
 
         with zenoh_errors(f"key {key!r}"):
-            zenoh.KeyExpr(key)  # refuses what is no key expression
+            zenoh.KeyExpr(key)  # refuses anything but a key expression
         with self._lock:
             if self._closing.is_set():
                 raise TransportError(f"key {key!r}: the transport is closed")
@@ -338,7 +338,7 @@ class ZenohTransport:
     def _declare_until_end(
         self, key: str, declare: Callable[[Any], Any], ended: threading.Event, close: Callable[[], None] = lambda: None
     ) -> Callable[[], None]:
-        """Declare an entity; return the function that ends it, in this session and in one that opens later."""
+        """Declare an entity; return a function that ends it, in this session and in one opened later."""
         declared: list[Any] = []
 
         def declare_unless_ended(session: Any) -> None:
