@@ -10,12 +10,14 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from laspy.vlrs.known import WktCoordinateSystemVlr
 
 from coview_stream.basemap.basemap import BaseMap
 from coview_stream.cli import main
 from coview_stream.cli.build import _announce
 from coview_stream.clouds import progress
 from coview_stream.clouds.files import write_cloud
+from tests.clouds.las_file import written
 
 
 @pytest.fixture
@@ -27,11 +29,14 @@ def cloud(map_points, tmp_path):
 
 def test_build_writes_and_describes_a_map(cloud, tmp_path, capsys):
     target = tmp_path / "site.coview"
-    assert main(["build", str(cloud), "-o", str(target), "--radius", "20", "--block-size", "3"]) == 0
+    options = ["--preset", "tls", "--rings", "5", "--sectors", "8", "--block-size", "3"]
+    assert main(["build", str(cloud), "-o", str(target), *options, "--channels", "coview, scan_context"]) == 0
     out = capsys.readouterr().out
     built = BaseMap.load(target)
     assert built.config.block == 3.0
-    assert built.descriptor_config.radius == 20.0
+    config = built.descriptor_config
+    assert (config.radius, config.rings, config.sectors) == (100.0, 5, 8)
+    assert config.channels == ("coview", "scan_context")
     for fact in (f"{len(built)} stations", f"{len(built.points)} kept", f"{target.stat().st_size} bytes", " s,"):
         assert fact in out
 
@@ -48,17 +53,6 @@ def test_last_line_tells_what_the_map_covers_and_warnings_are_one_line_each(map_
     lines = captured.err.splitlines()
     assert [line for line in lines if "points/m2 are few" in line]
     assert all(line.startswith("coview-stream: warning: ") for line in lines if "warning" in line.lower())
-
-
-def test_preset_channels_and_descriptor_options(cloud, tmp_path):
-    target = tmp_path / "site.coview"
-    options = ["--preset", "tls", "--rings", "5", "--sectors", "8"]
-    options += ["--channels", "coview, scan_context"]
-    assert main(["build", str(cloud), "-o", str(target), *options]) == 0
-    config = BaseMap.load(target).descriptor_config
-    assert config.radius == 100.0
-    assert config.channels == ("coview", "scan_context")
-    assert (config.rings, config.sectors) == (5, 8)
 
 
 @pytest.mark.parametrize(
@@ -156,9 +150,9 @@ def test_map_has_no_name_of_another_format(cloud, world_file, tmp_path, refused,
 @pytest.mark.slow
 @pytest.mark.parametrize("output", ["site.coview", "site/"])
 def test_reference_system_that_a_file_does_not_have_is_warned_of(map_points, tmp_path, capsys, output):
-    pytest.importorskip("pyproj")
-    near = map_points[(np.abs(map_points[:, :2]) < 9.0).all(axis=1)]
-    write_las(tmp_path / "site.las", np.add(near, (448_000.0, 5_400_000.0, 90.0)), "EPSG:32632")
+    system = WktCoordinateSystemVlr(pytest.importorskip("pyproj").CRS("EPSG:32632").to_wkt())
+    near = map_points[(np.abs(map_points[:, :2]) < 9.0).all(axis=1)] + (448_000.0, 5_400_000.0, 90.0)
+    written(tmp_path / "site.las", near, "1.4", 6, [system])
     words = ["build", str(tmp_path / "site.las"), "-o", f"{tmp_path}/{output}", "--no-learned", "--crs"]
     assert main([*words, "EPSG:25833"]) == 0
     said = capsys.readouterr()
@@ -167,16 +161,6 @@ def test_reference_system_that_a_file_does_not_have_is_warned_of(map_points, tmp
     assert "crs EPSG:32632" in said.out
     assert main([*words, "EPSG:32632"]) == 0
     assert "ignored" not in capsys.readouterr().err
-
-
-def write_las(path, points, system):
-    laspy = pytest.importorskip("laspy")
-    header = laspy.LasHeader(point_format=6, version="1.4")
-    header.scales, header.offsets = np.full(3, 0.001), np.floor(points.min(axis=0))
-    header.add_crs(pytest.importorskip("pyproj").CRS(system))
-    las = laspy.LasData(header)
-    las.x, las.y, las.z = points.T
-    las.write(str(path))
 
 
 STAGES = (
@@ -209,21 +193,26 @@ def test_large_build_says_how_long_it_takes(tmp_path, capsys):
     assert re.search(r"0\.0 million points on 2 km2: 3 min .* a map of 0\.7 GB", capsys.readouterr().err)
 
 
+@pytest.fixture
+def stdin(monkeypatch):
+    """Sets the bytes that come on stdin."""
+    return lambda sent: monkeypatch.setattr("sys.stdin", io.TextIOWrapper(io.BytesIO(sent)))
+
+
 @pytest.mark.parametrize("name", ["-", "/dev/stdin"])
-def test_stdin_that_is_no_cloud_is_called_stdin(tmp_path, monkeypatch, refused, name):
+def test_stdin_that_is_no_cloud_is_called_stdin(tmp_path, stdin, refused, name):
     for sent, found in ((b"", "stdin: nothing came (0 bytes)"), (b"hello\n", "stdin: no point in the first 100 lines")):
-        monkeypatch.setattr("sys.stdin", io.TextIOWrapper(io.BytesIO(sent)))
+        stdin(sent)
         assert f"error: {found}" in refused("build", name, "-o", tmp_path / "x.coview")
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("packed", [False, True], ids=["xyz", "xyz.gz"])
-def test_cloud_on_stdin_is_read_by_its_first_bytes(map_points, tmp_path, capsys, monkeypatch, refused, packed):
+def test_cloud_on_stdin_is_read_by_its_first_bytes(map_points, tmp_path, capsys, stdin, refused, packed):
     near = map_points[(np.abs(map_points[:, :2]) < 8.0).all(axis=1)]
     text = "\n".join("{:.2f} {:.2f} {:.2f}".format(*row) for row in near).encode()
-    stdin = io.TextIOWrapper(io.BytesIO(gzip.compress(text) if packed else text))
-    monkeypatch.setattr("sys.stdin", stdin)
+    stdin(gzip.compress(text) if packed else text)
     assert main(["build", "-", "-o", str(tmp_path / "site.coview"), "--radius", "20", "--no-learned"]) == 0
     assert f"{len(near)} points read" in capsys.readouterr().out
-    monkeypatch.setattr("sys.stdin", io.TextIOWrapper(io.BytesIO(b"PK\x03\x04\0\0")))
+    stdin(b"PK\x03\x04\0\0")
     assert "stdin is no cloud" in refused("build", "-", "-o", tmp_path / "x.coview")

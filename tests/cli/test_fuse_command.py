@@ -95,9 +95,3 @@ def test_bad_usage_is_one_line(site, world_run, tmp_path, monkeypatch, refused, 
     monkeypatch.chdir(tmp_path)
     assert why in refused("fuse", site / "site.coview", f"{world_run}:{site / 'out'}", *arguments)
     assert not list(tmp_path.iterdir())
-
-
-def test_results_of_another_map_are_refused(site, world_file, world_run, tmp_path, refused):
-    out = tmp_path / "fused.laz"
-    assert "another map" in refused("fuse", world_file, f"{world_run}:{site / 'out'}", "-o", out)
-    assert not out.exists()

@@ -94,11 +94,6 @@ def test_errors_are_printed_as_one_line(command, capsys, error, code, text):
     assert "Traceback" not in err
 
 
-def test_command_exit_code_is_returned(command):
-    command(lambda args: 1)
-    assert cli.main(["info"]) == 1
-
-
 def test_unexpected_exception_keeps_its_traceback(command):
     command(lambda args: _raise(ZeroDivisionError()))
     with pytest.raises(ZeroDivisionError):

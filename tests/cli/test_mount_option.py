@@ -37,17 +37,6 @@ def turned_run(world_run, tmp_path_factory):
 
 
 @pytest.mark.slow
-def test_run_of_a_turned_lidar_is_localized_as_that_of_the_body(world_file, world_run, turned_run, tmp_path, capsys):
-    command = ["locate", str(world_file)]
-    assert main([*command, str(world_run), "-o", str(tmp_path / "a"), "--no-pictures"]) == 0
-    assert main([*command, str(turned_run), "-o", str(tmp_path / "b"), "--no-pictures", f"--mount={MOUNT}"]) == 0
-    assert capsys.readouterr().err == ""
-    (stamps, poses), (again, same) = (read_tum(tmp_path / name / "trajectory.tum") for name in "ab")
-    assert (stamps == again).all()
-    assert np.abs(poses - same).max() < 5e-3  # float32 of the turned points
-
-
-@pytest.mark.slow
 def test_level_contains_the_lever_arm_and_heading_that_nobody_has_stated(
     world_file, world_run, world_drive, turned_run, tmp_path
 ):
@@ -59,15 +48,6 @@ def test_level_contains_the_lever_arm_and_heading_that_nobody_has_stated(
     off = inverse(world_drive.T_map_body[round((stamps[-1] - 100.0) / 0.5)]) @ poses[-1]
     assert 0.4 < np.linalg.norm(off[:3, 3]) < level["m"] < 12.0
     assert np.degrees(rotation_angle(off[:3, :3])) < level["deg"]
-
-
-def test_live_clouds_are_turned_as_they_come():
-    points = np.random.default_rng(0).uniform(-20, 20, (200, 3)).astype(np.float32)
-    robot = Robot(NodeConfig(mount=parse_mount(MOUNT)))
-    robot.moved(0.0)
-    robot.saw(0.0, points=turned(points))
-    robot.moved(0.05)
-    assert np.allclose(robot.session.take_job("track").points, points, atol=1e-4)
 
 
 def test_live_sweep_of_a_turned_lidar_is_deskewed_as_that_of_the_body():

@@ -38,9 +38,10 @@ class Node:
         self.transport = open_transport(listen=[self.endpoint])
         self.sent = []
 
-    def subscribe(self, cloud="coview/r1/in/cloud", odometry="coview/r1/in/odom", hint=None):
-        self.transport.subscribe(cloud, lambda s: self.sent.append(decode_cloud(s, hint=hint)), "all")
-        self.transport.subscribe(odometry, lambda s: self.sent.append(decode_odometry(s, hint=hint)), "all")
+    def subscribe(self, cloud="coview/r1/in/cloud", odometry="coview/r1/in/odom", codecs=(None, None)):
+        """Take down both, in these codecs alone."""
+        self.transport.subscribe(cloud, lambda s: self.sent.append(decode_cloud(s, option=codecs[0])), "all")
+        self.transport.subscribe(odometry, lambda s: self.sent.append(decode_odometry(s, option=codecs[1])), "all")
 
     def replay(self, run, *options):
         """Replay a run to this node; return the exit code."""
@@ -100,8 +101,11 @@ def test_replay_of_clouds_without_odometry(node, run_folder, tmp_path, capsys):
 @pytest.mark.parametrize(
     ("options", "keys"),
     [
-        (["--encoding", "foxglove", "--odometry-encoding", "cdr"], ()),
-        (["--preset", "ros2dds"], ("r1/points", "r1/odom", "cdr")),
+        (
+            ["--encoding", "foxglove", "--odometry-encoding", "cdr"],
+            ("coview/r1/in/cloud", "coview/r1/in/odom", ("foxglove", "cdr")),
+        ),
+        (["--preset", "ros2dds"], ("r1/points", "r1/odom", ("cdr", "cdr"))),
     ],
 )
 def test_replay_in_other_encodings_and_to_other_keys(node, run_folder, options, keys):

@@ -52,16 +52,12 @@ def test_locate_passes_risk_option_to_the_search(world_file, world_run, tmp_path
     assert {each["state"] for each in result["keyframes"]} == {"AMBIGUOUS"}
 
 
-def test_locate_reloc_learned_on_map_without_features_names_remedy(world_file, tmp_path, refused):
+def test_reloc_learned_on_map_without_features_names_remedy(world_file, tmp_path, refused):
     run, out = tmp_path / "not-even-looked-for", tmp_path / "out"
-    said = refused("locate", world_file, run, "-o", out, "--reloc", "learned")
-    assert "build it again" in said
-    assert "--reloc coview" in said
-
-
-def test_serve_reloc_learned_on_map_without_features_fails_before_opening(world_file, refused):
-    given = ["--robot", "r1", "--reloc", "learned", "--no-state", "--quiet"]
-    assert "build it again" in refused("serve", world_file, *given)
+    for command in (["locate", world_file, run, "-o", out], ["serve", world_file, "--robot", "r1", "--no-state"]):
+        said = refused(*command, "--reloc", "learned")
+        assert "build it again" in said
+        assert "--reloc coview" in said
 
 
 @pytest.mark.slow

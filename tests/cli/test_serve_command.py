@@ -113,12 +113,6 @@ def test_serve_odometry_kiss_icp_names_missing_library(tmp_path, monkeypatch, wo
     assert install_command("kiss-icp") in refused(*command, "--odometry", "kiss-icp")
 
 
-def test_unreadable_map_is_refused(tmp_path, refused):
-    path = tmp_path / "broken.coview"
-    path.write_bytes(b"no map")
-    assert "broken.coview" in refused("serve", path, "--robot", "r1", "--listen", free_endpoint())
-
-
 def test_max_payload_reaches_the_transport(monkeypatch, world_file):
     def open_transport(*args, **options):
         raise ConfigError(f"asked with {args}")

@@ -74,7 +74,6 @@ def test_the_command_line_goes_before_the_file(world_file, tmp_path):
         ('robot = "a"\nreloc = "icp"\n', "reloc is 'icp'; choose one of auto, coview, learned"),
         ('robot = "a"\nlocalizer = 3\n', "localizer is 3; write a table [localizer]"),
         ('robot = "a"\n[node]\npose_rte = 3\n', "[node]: unknown key 'pose_rte'; did you mean 'pose_rate'?"),
-        ('robot = "a"\n[localizer.keyframe]\ndistance = -1\n', "distance is -1"),
         ("[node]\n", "--robot is missing"),
         ("robot = 3\nsite = 3\n", "site is 3 (int); write the map as a text"),
         ('robot = "a"\n[localizer]\nsensor_leans = false\n', "sensor_leans cannot be set here"),

@@ -69,7 +69,3 @@ def test_build_with_a_wrong_key_reads_no_cloud(site, refused):
     target, key = site / "none.coview", site / "ours.pub"
     assert "holds no private key" in refused("build", site / "not-even-looked-for.ply", "-o", target, "--sign", key)
     assert not target.exists()
-
-
-def test_keygen_overwrites_nothing(site, refused):
-    assert "exists" in refused("keygen", site / "ours")

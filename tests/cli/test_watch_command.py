@@ -177,11 +177,6 @@ def test_closed_pipe_prints_no_traceback(node, start):
     assert running.stderr.read() == ""
 
 
-def test_watch_ends_after_seconds_option(node, capsys):
-    assert main(["watch", "--connect", node.endpoint, "--seconds", "0.2", "--json"]) == 0
-    assert capsys.readouterr().err == ""
-
-
 def test_missing_viewer_library_is_named(monkeypatch, capsys):
     monkeypatch.setitem(sys.modules, "rerun", None)
     assert main(["watch", "--listen", free_endpoint(), "--rerun"]) == 2

@@ -4,14 +4,11 @@ import json
 import queue
 import re
 import socket
-import subprocess
 import threading
 import urllib.request
 
 import pytest
 from sockets import free_endpoint
-
-from coview_stream.clouds.python_child import python_command, python_environment
 
 
 @pytest.mark.parametrize("command", [["serve", "--robot", "r1", "--web", "site.coview"], ["watch", "--web", "here"]])
@@ -38,19 +35,11 @@ def test_a_demo_without_a_node_has_no_page(refused):
 class Command:
     """A command with a page, and the events of that page."""
 
-    def __init__(self, *words):
-        command = python_command("coview_stream", *words, "--web", "127.0.0.1:0")
-        self.process = subprocess.Popen(
-            command, env=python_environment(), stderr=subprocess.PIPE, stdout=subprocess.DEVNULL, text=True
-        )
-        self.events = queue.Queue()
-        for line in self.process.stderr:
-            found = re.fullmatch(r"page at (http://\S+)\n", line)
-            if found:
-                self.url = found.group(1)
-                break
-        threading.Thread(target=self.process.stderr.read, daemon=True).start()
-        threading.Thread(target=self._listen, daemon=True).start()
+    def __init__(self, process):
+        self.process, self.events = process, queue.Queue()
+        self.url = next(found[1] for line in process.stderr if (found := re.match(r"page at (http://\S+)\n", line)))
+        for read in (process.stdout.read, process.stderr.read, self._listen):
+            threading.Thread(target=read, daemon=True).start()
 
     def _listen(self):
         with urllib.request.urlopen(f"{self.url}events", timeout=60) as stream:
@@ -71,22 +60,18 @@ class Command:
 
     def end(self):
         self.process.terminate()
-        code = self.process.wait(10.0)
-        self.process.stderr.close()
-        return code
+        return self.process.wait(10.0)
 
 
 @pytest.mark.slow
-def test_serve_and_watch_show_robot_and_map(world_file, tmp_path):
-    endpoint = free_endpoint()
-    serve = Command("serve", str(world_file), "--robot", "r1", "--listen", endpoint, "--state", str(tmp_path))
-    watch = Command("watch", "--connect", endpoint)
-    try:
-        for command in (serve, watch):
-            seen = command.wait("status", "map")
-            assert (seen["status"]["robot"], seen["status"]["state"]) == ("r1", "SEARCHING")
-            assert seen["status"]["map_sha256"] == seen["map"]["sha256"]
-            with urllib.request.urlopen(f"{command.url}map/{seen['map']['sha256']}", timeout=30) as answer:
-                assert len(answer.read()) > 6 * seen["map"]["count"]
-    finally:
-        assert [watch.end(), serve.end()] == [0, 0]
+def test_serve_and_watch_show_robot_and_map(world_file, start):
+    web, endpoint = ("--web", "127.0.0.1:0"), free_endpoint()
+    serve = Command(start("serve", world_file, "--robot", "r1", "--listen", endpoint, "--no-state", *web))
+    watch = Command(start("watch", "--connect", endpoint, *web))
+    for command in (serve, watch):
+        seen = command.wait("status", "map")
+        assert (seen["status"]["robot"], seen["status"]["state"]) == ("r1", "SEARCHING")
+        assert seen["status"]["map_sha256"] == seen["map"]["sha256"]
+        with urllib.request.urlopen(f"{command.url}map/{seen['map']['sha256']}", timeout=30) as answer:
+            assert len(answer.read()) > 6 * seen["map"]["count"]
+    assert [watch.end(), serve.end()] == [0, 0]
