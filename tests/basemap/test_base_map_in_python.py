@@ -2,14 +2,13 @@
 
 import pickle
 import shutil
-import sys
 
 import numpy as np
 import pytest
 
 from coview_stream.basemap.basemap import BaseMap
 from coview_stream.basemap.sources import sources_of
-from coview_stream.errors import CloudError, ConfigError, CoViewWarning, DependencyError, MapError
+from coview_stream.errors import CloudError, ConfigError, CoViewWarning, MapError
 from tests.basemap.test_build import SMALL, UTM
 
 
@@ -84,11 +83,9 @@ def test_coarse_float32_coordinates_are_told(cut):
         sources_of(cut.astype(np.float32))[0].read()
 
 
-def test_extent_area_and_density_are_those_of_the_points(from_array, cut):
+def test_extent_is_that_of_the_points(from_array, cut):
     np.testing.assert_allclose(from_array.bounds, [cut.min(axis=0), cut.max(axis=0)], atol=0.3)
     assert from_array.bounds.dtype == np.float64
-    assert 300.0 <= from_array.summary.area <= 441.0
-    assert from_array.summary.density == pytest.approx(len(from_array.points) / from_array.summary.area)
     there = from_array.world_points()
     np.testing.assert_array_equal(there - from_array.origin, from_array.points.astype(np.float64))
 
@@ -116,13 +113,6 @@ def test_picture_shows_the_points_where_they_are(from_array, cut):
     x, y, _ = from_array.world_points()[np.argmax(from_array.points[:, 2])]
     row, column = int((y - bottom) / 0.375), int((x - left) / 0.375)
     assert values[row, column] == np.nanmin(values)
-
-
-def test_picture_without_matplotlib_says_what_to_install(from_array, monkeypatch):
-    monkeypatch.setitem(sys.modules, "matplotlib", None)
-    monkeypatch.setitem(sys.modules, "matplotlib.pyplot", None)
-    with pytest.raises(DependencyError, match="pictures of maps"):
-        from_array.plot()
 
 
 def test_loaded_map_is_pickled_as_its_path(world_file, tmp_path):

@@ -73,31 +73,6 @@ def test_map_from_several_files_equals_map_from_one(whole, cut, tmp_path):
     assert len(one ^ two) <= 0.05 * len(one)
 
 
-@pytest.mark.slow
-def test_two_storeys_give_two_stations_in_one_cell(tmp_path):
-    axis = np.arange(-8.0, 8.0, 0.2)
-    x, y = (v.ravel() for v in np.meshgrid(axis, axis))
-    floors = [np.column_stack([x, y, np.full_like(x, z)]) for z in (0.0, 3.5, 7.0)]  # the last is the roof
-    z = np.arange(0, 7, 0.2)
-    walls = []
-    for side in (-8.0, 8.0):
-        a, h = (v.ravel() for v in np.meshgrid(axis, z))
-        walls += [np.column_stack([np.full_like(a, side), a, h]), np.column_stack([a, np.full_like(a, side), h])]
-    yard = np.random.default_rng(0).uniform(-25, 25, (30_000, 2))
-    yard = yard[(np.abs(yard) > 8).any(axis=1)]
-    ground = np.column_stack([yard, np.zeros(len(yard))])
-    np.save(tmp_path / "house.npy", np.concatenate([*floors, *walls, ground]))
-    both = BaseMap.build(tmp_path / "house.npy", **SMALL)
-    heights = both.stations[:, 2] + both.origin[2]
-    inside = (np.abs(both.stations[:, :2] + both.origin[:2]) < 6.0).all(axis=1)
-    assert (np.abs(heights[inside] - 0.0) < 0.4).sum() > 20
-    assert (np.abs(heights[inside] - 3.5) < 0.4).sum() > 20
-    assert (heights < 5.0).all()  # no station on the roof
-    flat = BaseMap.build(tmp_path / "house.npy", levels=False, **SMALL)
-    cells = np.floor(flat.stations[:, :2] / 2.0)
-    assert len(np.unique(cells, axis=0)) == len(flat)
-
-
 def test_built_map_round_trips_through_its_file(whole, tmp_path):
     path = tmp_path / "site.coview"
     digest = whole.save(path)
@@ -137,23 +112,6 @@ def test_surveyed_cells_reach_one_cell_beyond_the_points():
     assert grid.shape == (7, 3)
     assert grid[:, 1].tolist() == [1, 1, 1, 0, 1, 1, 1]
     assert grid[:, 0].tolist() == grid[:, 2].tolist() == grid[:, 1].tolist()
-
-
-@pytest.mark.parametrize(
-    ("points", "error", "text"),
-    [
-        (np.empty((0, 3)), CloudError, "bad.npy"),
-        (np.full((5000, 3), np.nan), CloudError, "bad.npy"),
-        (np.random.default_rng(0).uniform(0, 9, (200, 3)), MapError, "points are left"),
-        (np.zeros((5000, 3)), MapError, "points are left"),
-        (np.random.default_rng(0).uniform(0, 9, (5000, 2)), CloudError, "bad.npy"),
-    ],
-)
-def test_invalid_input_is_refused_in_one_line(tmp_path, points, error, text):
-    np.save(tmp_path / "bad.npy", points)
-    with pytest.raises(error, match=text) as caught:
-        BaseMap.build(tmp_path / "bad.npy")
-    assert "\n" not in str(caught.value)
 
 
 def test_missing_source_is_refused(tmp_path):

@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from coview_stream.basemap.basemap import BaseMap
 from coview_stream.basemap.ground import GroundRaster, cloth_available, ground_filter, ground_mask
 from coview_stream.basemap.stations import find_stations
 from coview_stream.errors import ConfigError, DependencyError
@@ -148,6 +149,15 @@ def test_floors_of_a_house(storeys):
     np.testing.assert_allclose(upper[:, 2], 3.3, atol=0.15)
     assert (np.abs(upper[:, :2]) < [10, 8]).all()
     np.testing.assert_array_equal(np.mod(levels[:, :2], 2.0), 1.0)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("levels", [True, False])
+def test_map_has_stations_on_upper_floors_unless_it_is_to_have_none(storeys, levels):
+    base_map = BaseMap.build(storeys, levels=levels, radius=15.0)
+    heights = base_map.stations[:, 2] + base_map.origin[2]
+    assert ((np.abs(heights - 3.3) < 0.2).sum() > 60) == (heights > 1.0).any() == levels
+    assert (heights < 4.0).all()  # none on the roof
 
 
 @pytest.mark.parametrize(("half", "ceiling", "count"), [(10.0, 2.5, 100), (2.0, 2.5, 0), (10.0, 1.5, 0)])

@@ -40,10 +40,6 @@ def undescribed(small):
     return {name: values for name, values in small[0].items() if not name.startswith(("station_codes", "descriptor"))}
 
 
-def test_whole_map_is_loaded(small, load):
-    assert len(load(*small)) == len(small[0]["stations"])
-
-
 NAMES = ["origin", "stations", "points", "normals", "tile_index", "surveyed", "surveyed_corner", "descriptor.coview",
          "field.tiles", "field.occupied", "field.ground", "field.edge", "station_codes", "station_codes.basis",
          "station_codes.rest.step", "station_codes.norm"]  # fmt: skip
