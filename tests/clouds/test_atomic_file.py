@@ -60,11 +60,6 @@ def test_private_file_is_its_owners_and_follows_no_link(tmp_path):
     assert path.stat().st_mode & 0o777 == 0o600
 
 
-def test_missing_directory_is_an_os_error(tmp_path):
-    with pytest.raises(OSError, match="no"), atomic_file(tmp_path / "no" / "a.bin"):
-        pass
-
-
 def test_parts_that_nobody_writes_are_removed_and_no_others(tmp_path):
     path = tmp_path / "a.bin"
     gone = subprocess.Popen([sys.executable, "-c", ""])

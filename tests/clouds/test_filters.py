@@ -23,13 +23,8 @@ def test_outliers_are_removed_and_plane_is_kept():
     assert mask[:4000].mean() > 0.99
 
 
-def test_points_that_are_all_as_far_apart_are_kept():
-    points = np.zeros((30, 3), dtype=np.float32)
-    assert len(remove_outliers(points)[0]) == 30
-
-
-@pytest.mark.parametrize("count", [0, 1, 20])
-def test_too_few_points_for_outliers_are_kept(count):
+@pytest.mark.parametrize("count", [0, 1, 20, 30])
+def test_too_few_points_for_outliers_and_points_that_are_all_as_far_apart_are_kept(count):
     kept, mask = remove_outliers(np.zeros((count, 3), np.float32))
     assert len(kept) == count
     assert mask.all()

@@ -24,38 +24,29 @@ def odometry_codec(payload=b"?", encoding="", key="coview/r1/in/odom", option=No
 
 
 @pytest.mark.parametrize(
-    ("encoding", "name"),
+    ("codec", "encoding", "name"),
     [
-        ("application/octet-stream;layout=xyz", "xyz"),
-        ('Application/Octet-Stream ; Layout = "XYZI"', "xyzi"),
-        ("zenoh/bytes;layout=xyz", "xyz"),
-        ("application/cdr", "cdr"),
-        ("application/cdr;sensor_msgs/msg/PointCloud2", "cdr"),
-        ("application/cdr; sensor_msgs::msg::dds_::PointCloud2_", "cdr"),
-        ("application/cdr;schema='sensor_msgs/PointCloud2'", "cdr"),
-        ("application/protobuf;foxglove.PointCloud", "foxglove"),
-        ("application/protobuf; schema=foxglove.PointCloud", "foxglove"),
-        ('application/x-protobuf;schema="foxglove.PointCloud"; v=1', "foxglove"),
-        ("application/protobuf", "foxglove"),
-        ("application/protobuf;core.Envelope", "keelson"),
+        (cloud_codec, "application/octet-stream;layout=xyz", "xyz"),
+        (cloud_codec, 'Application/Octet-Stream ; Layout = "XYZI"', "xyzi"),
+        (cloud_codec, "zenoh/bytes;layout=xyz", "xyz"),
+        (cloud_codec, "application/cdr", "cdr"),
+        (cloud_codec, "application/cdr;sensor_msgs/msg/PointCloud2", "cdr"),
+        (cloud_codec, "application/cdr; sensor_msgs::msg::dds_::PointCloud2_", "cdr"),
+        (cloud_codec, "application/cdr;schema='sensor_msgs/PointCloud2'", "cdr"),
+        (cloud_codec, "application/protobuf;foxglove.PointCloud", "foxglove"),
+        (cloud_codec, "application/protobuf; schema=foxglove.PointCloud", "foxglove"),
+        (cloud_codec, 'application/x-protobuf;schema="foxglove.PointCloud"; v=1', "foxglove"),
+        (cloud_codec, "application/protobuf", "foxglove"),
+        (cloud_codec, "application/protobuf;core.Envelope", "keelson"),
+        (odometry_codec, "application/json", "json"),
+        (odometry_codec, "text/json; charset=utf-8", "json"),
+        (odometry_codec, "application/cdr;nav_msgs/msg/Odometry", "cdr"),
+        (odometry_codec, "application/protobuf;foxglove.PoseInFrame", "foxglove"),
+        (odometry_codec, "application/protobuf;foxglove.FrameTransform", "foxglove"),
     ],
 )
-def test_common_spellings_of_cloud_encodings(encoding, name):
-    assert cloud_codec(encoding=encoding) == name
-
-
-@pytest.mark.parametrize(
-    ("encoding", "name"),
-    [
-        ("application/json", "json"),
-        ("text/json; charset=utf-8", "json"),
-        ("application/cdr;nav_msgs/msg/Odometry", "cdr"),
-        ("application/protobuf;foxglove.PoseInFrame", "foxglove"),
-        ("application/protobuf;foxglove.FrameTransform", "foxglove"),
-    ],
-)
-def test_common_spellings_of_odometry_encodings(encoding, name):
-    assert odometry_codec(encoding=encoding) == name
+def test_common_spellings_of_encodings(codec, encoding, name):
+    assert codec(encoding=encoding) == name
 
 
 @pytest.mark.parametrize(

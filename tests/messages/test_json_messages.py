@@ -65,24 +65,19 @@ def test_location_in_json():
     assert fields["covariance_enu"] == [1, 0, 0, 0, 2, 0, 0, 0, 3]
 
 
-def test_location_as_navsatfix():
-    encoded = encode_location(LOCATION, "cdr")
-    assert encoded.encoding == "application/cdr;sensor_msgs/msg/NavSatFix"
-    fix = ros2.store().deserialize_cdr(encoded.payload, "sensor_msgs/msg/NavSatFix")
-    assert (fix.latitude, fix.longitude, fix.altitude) == (50.123456789, -8.5, 101.25)
-    assert (fix.header.stamp.sec, fix.header.stamp.nanosec) == (1_700_000_000, 5)
-    assert list(fix.position_covariance) == [1, 0, 0, 0, 2, 0, 0, 0, 3]
-    assert fix.position_covariance_type == 3
-
-
-def test_location_of_foxglove():
+def test_location_as_navsatfix_and_of_foxglove():
     from foxglove_schemas_protobuf.LocationFix_pb2 import LocationFix
 
-    encoded = encode_location(LOCATION, "foxglove")
-    fix = LocationFix.FromString(encoded.payload)
-    assert (fix.latitude, fix.longitude, fix.altitude) == (50.123456789, -8.5, 101.25)
-    assert (fix.timestamp.seconds, fix.timestamp.nanos) == (1_700_000_000, 5)
-    assert list(fix.position_covariance) == [1, 0, 0, 0, 2, 0, 0, 0, 3]
+    encoded = encode_location(LOCATION, "cdr")
+    assert encoded.encoding == "application/cdr;sensor_msgs/msg/NavSatFix"
+    ros = ros2.store().deserialize_cdr(encoded.payload, "sensor_msgs/msg/NavSatFix")
+    assert (ros.header.stamp.sec, ros.header.stamp.nanosec) == (1_700_000_000, 5)
+    assert ros.position_covariance_type == 3
+    foxglove = LocationFix.FromString(encode_location(LOCATION, "foxglove").payload)
+    assert (foxglove.timestamp.seconds, foxglove.timestamp.nanos) == (1_700_000_000, 5)
+    for fix in (ros, foxglove):
+        assert (fix.latitude, fix.longitude, fix.altitude) == (50.123456789, -8.5, 101.25)
+        assert list(fix.position_covariance) == [1, 0, 0, 0, 2, 0, 0, 0, 3]
 
 
 def test_other_encodings_of_locations_are_refused():

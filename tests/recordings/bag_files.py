@@ -58,26 +58,22 @@ def cloud(stamp_ns, points, times=None, order="<", frame="body"):
     )
 
 
+def geometry(name, /, **values):
+    return message(f"geometry_msgs/msg/{name}", **values)
+
+
+def quaternion(T):
+    x, y, z, w = Rotation.from_matrix(T[:3, :3]).as_quat()
+    return geometry("Quaternion", x=x, y=y, z=z, w=w)
+
+
 def odometry(stamp_ns, T, child="body"):
     x, y, z = T[:3, 3]
-    qx, qy, qz, qw = Rotation.from_matrix(T[:3, :3]).as_quat()
-    pose = message(
-        "geometry_msgs/msg/Pose",
-        position=message("geometry_msgs/msg/Point", x=x, y=y, z=z),
-        orientation=message("geometry_msgs/msg/Quaternion", x=qx, y=qy, z=qz, w=qw),
-    )
-    zero = message("geometry_msgs/msg/Vector3", x=0.0, y=0.0, z=0.0)
-    return message(
-        ODOMETRY,
-        header=header(stamp_ns, "odom"),
-        child_frame_id=child,
-        pose=message("geometry_msgs/msg/PoseWithCovariance", pose=pose, covariance=np.zeros(36)),
-        twist=message(
-            "geometry_msgs/msg/TwistWithCovariance",
-            twist=message("geometry_msgs/msg/Twist", linear=zero, angular=zero),
-            covariance=np.zeros(36),
-        ),
-    )
+    pose = geometry("Pose", position=geometry("Point", x=x, y=y, z=z), orientation=quaternion(T))
+    zero, unknown = geometry("Vector3", x=0.0, y=0.0, z=0.0), np.zeros(36)
+    twist = geometry("TwistWithCovariance", twist=geometry("Twist", linear=zero, angular=zero), covariance=unknown)
+    placed = geometry("PoseWithCovariance", pose=pose, covariance=unknown)
+    return message(ODOMETRY, header=header(stamp_ns, "odom"), child_frame_id=child, pose=placed, twist=twist)
 
 
 def transforms(stamp_ns, *edges):
@@ -85,14 +81,9 @@ def transforms(stamp_ns, *edges):
     messages = []
     for parent, child, T in edges:
         x, y, z = T[:3, 3]
-        qx, qy, qz, qw = Rotation.from_matrix(T[:3, :3]).as_quat()
-        moved = message(
-            "geometry_msgs/msg/Transform",
-            translation=message("geometry_msgs/msg/Vector3", x=x, y=y, z=z),
-            rotation=message("geometry_msgs/msg/Quaternion", x=qx, y=qy, z=qz, w=qw),
-        )
-        values = {"header": header(stamp_ns, parent), "child_frame_id": child, "transform": moved}
-        messages.append(message("geometry_msgs/msg/TransformStamped", **values))
+        moved = geometry("Transform", translation=geometry("Vector3", x=x, y=y, z=z), rotation=quaternion(T))
+        head = header(stamp_ns, parent)
+        messages.append(geometry("TransformStamped", header=head, child_frame_id=child, transform=moved))
     return message(TRANSFORMS, transforms=messages)
 
 

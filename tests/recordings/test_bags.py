@@ -90,7 +90,8 @@ def test_poses_between_samples_are_interpolated(tmp_path):
 
 @pytest.mark.parametrize("order", ["<", ">"])
 @pytest.mark.parametrize(("begin", "end"), [(0.0, 0.1), (-0.1, 0.0)])
-def test_sweep_is_deskewed(tmp_path, order, begin, end):
+@pytest.mark.parametrize("mount", ["0,0,0", "180,10,90,0.3,-0.2,0.5"])
+def test_sweep_is_turned_and_then_deskewed(tmp_path, order, begin, end, mount):
     rng = np.random.default_rng(2)
     stamp = START + 400_000_000
     world = transform(T_at(stamp), rng.uniform(-25, 25, (300, 3)))
@@ -98,8 +99,9 @@ def test_sweep_is_deskewed(tmp_path, order, begin, end):
     swept = [transform(inverse(T_at(stamp + round(1e9 * t))), p[None])[0] for p, t in zip(world, times, strict=True)]
     at_once = transform(inverse(T_at(stamp)), world)
     swept[7][1] = np.nan
-    messages = [cloud(stamp, np.array(swept, np.float32), times, order)]
-    frame = open_run(write_bag(tmp_path / "bag", {"/points": messages, "/odom": driven()})).read(0)
+    seen = transform(inverse(parse_mount(mount).T_body_sensor), np.array(swept)).astype(np.float32)
+    bag = write_bag(tmp_path / "bag", {"/points": [cloud(stamp, seen, times, order)], "/odom": driven()})
+    frame = open_run(bag, mount=parse_mount(mount)).read(0)
     assert frame.dropped == 1
     kept = np.arange(len(world)) != 7
     assert np.linalg.norm(np.array(swept)[kept] - at_once[kept], axis=1).max() > 0.4
@@ -430,26 +432,3 @@ def test_topic_without_a_name_in_a_database_is_refused(tmp_path):
         connection.commit()
     with pytest.raises(RunError, match=r"b\.db3"):
         open_run(single)
-
-
-def test_sweeps_of_a_recording_are_turned_before_they_are_deskewed(tmp_path):
-    mount = parse_mount("180,10,90,0.3,-0.2,0.5")
-    points = np.random.default_rng(0).uniform(-20, 20, (200, 3)).astype(np.float32)
-    times = np.linspace(-0.1, 0.0, 200).astype(np.float32)
-    turned = transform(inverse(mount.T_body_sensor), points.astype(np.float64)).astype(np.float32)
-    poses = [pose_from(np.eye(3), [k, 0.0, 0.0]) for k in range(4)]
-
-    def bag(name, cloud_points):
-        return write_bag(
-            tmp_path / name,
-            {
-                "/points": [cloud(START + k * 100_000_000, cloud_points, times) for k in (1, 2)],
-                "/odom": [odometry(START + k * 100_000_000, poses[k]) for k in range(4)],
-            },
-        )
-
-    body = open_run(bag("body", points))
-    sensor = open_run(bag("sensor", turned), mount=mount)
-    assert np.abs(body.read(0).points - points).max() > 0.5  # there is something to deskew
-    for expected, frame in zip(body, sensor, strict=True):
-        assert np.allclose(expected.points, frame.points, atol=1e-4)

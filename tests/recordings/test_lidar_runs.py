@@ -1,8 +1,6 @@
 """Runs without odometry, in files and in recordings, around a registration that knows the truth."""
 
-import re
 import shutil
-import sys
 
 import numpy as np
 import pytest
@@ -10,7 +8,7 @@ import small_world
 from bag_files import cloud, odometry, write_bag
 from fake_lidar_odometry import Truth
 
-from coview_stream.cli import build_parser, main
+from coview_stream.cli import main
 from coview_stream.clouds.trajectory import read_tum
 from coview_stream.config.odometry import LidarOdometryConfig
 from coview_stream.errors import RunError
@@ -97,45 +95,17 @@ def test_locate_command_with_lidar_odometry(world_file, bare, world_drive, tmp_p
     monkeypatch.setattr(module, "KissRegistration", lambda config: Truth(world_drive.T_map_body))
     times(bare, 100.0 + 0.5 * np.arange(7))
     out = tmp_path / "out"
-    command = ["locate", str(world_file), str(bare), "-o", str(out), "--no-pictures", "--odometry", "kiss-icp"]
-    assert main(command) == 0
+    command = ["locate", "--no-pictures", "--odometry", "kiss-icp"]
+    files = [str(world_file), str(bare), "-o", str(out)]
+    assert main([*command, *files]) == 0
     assert "down is taken from the ground" in capsys.readouterr().err
     stamps, poses = read_tum(out / "trajectory.tum")
     truth = np.array(world_drive.T_map_body)[np.round((stamps - 100.0) / 0.5).astype(int)]
     assert len(stamps) >= 2
     assert np.linalg.norm(poses[:, :3, 3] - truth[:, :3, 3], axis=1).max() < 0.08
-    assert main([*command, "--gravity", "level"]) == 0
+    assert main([*command, "--gravity", "level", *files]) == 0
     assert "down is taken" not in capsys.readouterr().err
-    assert main([*command, "--gravity=-1e-3,0,-9.81"]) == 0
-
-
-@pytest.mark.parametrize("gravity", [["--gravity", "level"], ["--gravity=-1e-3,0,-9.81"]])
-def test_gravity_option_takes_one_value(gravity):
-    for command in ("locate", "serve"):
-        end = ["site.coview", "run", "-o", "out"] if command == "locate" else ["site.coview", "--robot", "a"]
-        args = build_parser().parse_args([command, "--odometry", "kiss-icp", *gravity, *end])
-        assert args.gravity == gravity[-1].removeprefix("--gravity=")
-
-
-def test_missing_kiss_icp_is_one_line(world_file, world_run, tmp_path, monkeypatch, refused):
-    monkeypatch.setitem(sys.modules, "kiss_icp", None)
-    monkeypatch.setitem(sys.modules, "kiss_icp.config", None)
-    said = refused("locate", world_file, world_run, "-o", tmp_path / "out", "--odometry", "kiss-icp")
-    assert re.search(r"pip install '(coview-stream\[)?kiss-icp", said)
-    assert not (tmp_path / "out").exists()
-
-
-@pytest.mark.parametrize(
-    ("options", "text"),
-    [
-        (["--gravity", "level"], "--gravity goes with --odometry kiss-icp"),
-        (["--odometry", "kiss-icp", "--gravity", "up"], "ground, level, or three numbers"),
-        (["--odometry", "kiss-icp", "--gravity", "0,0,9.8"], "accelerometer"),
-        (["--odometry", "kiss-icp", "--gravity="], "ground, level, or three numbers"),
-    ],
-)
-def test_invalid_gravity_options_are_refused(world_file, world_run, tmp_path, refused, options, text):
-    assert text in refused("locate", world_file, world_run, "-o", tmp_path / "out", *options)
+    assert main([*command, "--gravity=-1e-3,0,-9.81", *files]) == 0
 
 
 START = 1_700_000_000_000_000_000
