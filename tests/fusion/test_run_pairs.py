@@ -10,6 +10,8 @@ from coview_stream.clouds.trajectory import read_tum, write_tum
 from coview_stream.errors import InputError
 from coview_stream.fusion.localized_run import LocalizedRun, parse_pair
 
+pytestmark = pytest.mark.filterwarnings("ignore:.*which map:UserWarning")
+
 
 def test_paths_with_colons_are_parted_where_both_are_there(tmp_path):
     run, out = tmp_path / "a:b", tmp_path / "c:d"
@@ -61,18 +63,14 @@ def test_bridged_poses_are_left_out(world_run, world_map, results):
         {"kind": "bridged", "first_stamp": None},
     ]
     (results / "result.json").write_text(json.dumps({"map_sha256": "", "smoothed": stretches}))
-    with pytest.warns(UserWarning, match="which map"):
-        run = LocalizedRun(parse_pair(f"{world_run}:{results}"), world_map, opened)
+    run = LocalizedRun(parse_pair(f"{world_run}:{results}"), world_map, opened)
     np.testing.assert_allclose(run.stamps, [stamps[k] for k in (2, 3, 6)])
     assert run.without_pose == 4
 
 
 def test_a_trajectory_alone_will_do(world_run, world_map, results):
-    with pytest.warns(UserWarning, match="which map"):
-        runs = [
-            LocalizedRun(parse_pair(f"{world_run}:{results / 'trajectory.tum'}"), world_map, opened, delay)
-            for delay in (0.0, 0.2)
-        ]
+    pair = parse_pair(f"{world_run}:{results / 'trajectory.tum'}")
+    runs = [LocalizedRun(pair, world_map, opened, delay) for delay in (0.0, 0.2)]
     assert [len(run) for run in runs] == [5, 5]
     now, before = (next(frame for frame in run.frames() if frame is not None).T_map_body for run in runs)
     step = np.linalg.norm(np.diff(runs[0].odometry[:, :3, 3], axis=0), axis=1)[0] / np.diff(runs[0].stamps)[0]
@@ -96,7 +94,7 @@ def test_damaged_results_are_refused(world_run, world_map, results, text):
 
 def test_a_run_that_was_not_localized_is_refused(world_run, world_map, tmp_path):
     write_tum(tmp_path / "trajectory.tum", [], [])
-    with pytest.warns(UserWarning, match="which map"), pytest.raises(InputError, match="not localized"):
+    with pytest.raises(InputError, match="not localized"):
         LocalizedRun(parse_pair(f"{world_run}:{tmp_path}"), world_map, opened)
 
 
@@ -104,8 +102,7 @@ def test_a_run_that_was_not_localized_is_refused(world_run, world_map, tmp_path)
 def test_mount_and_lean_of_the_results_are_applied(world_run, world_drive, world_map, results, mount):
     told = {"map_sha256": "", "mount": mount, "calibration": {"roll_deg": 180.0}}
     (results / "result.json").write_text(json.dumps(told))
-    with pytest.warns(UserWarning, match="which map"):
-        run = LocalizedRun(parse_pair(f"{world_run}:{results}"), world_map, opened)
+    run = LocalizedRun(parse_pair(f"{world_run}:{results}"), world_map, opened)
     frame = next(frame for frame in run.frames() if frame is not None)
     raw = world_drive.clouds[2]
     expected = np.column_stack([-raw[:, 1], -raw[:, 0], -(raw[:, 2] + 1.0)])

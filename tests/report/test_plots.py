@@ -4,12 +4,7 @@ import numpy as np
 import pytest
 
 from coview_stream.errors import InputError
-from coview_stream.localization.offline import locate
-from coview_stream.localization.result import Fix
-from coview_stream.localization.state import State
-from coview_stream.recordings import open_run
 from coview_stream.report import plots
-from coview_stream.report.plots import draw_run
 
 NO_POINTS = np.zeros((0, 3))
 
@@ -124,15 +119,3 @@ def test_utm_coordinates_get_a_rounded_plot_offset(base):
 def test_unwritable_plot_names_its_file(tmp_path):
     with pytest.raises(InputError, match=r"missing/map\.png"):
         plots.plot_trajectory(NO_POINTS, NO_POINTS, [], tmp_path / "missing" / "map.png")
-
-
-@pytest.mark.slow
-def test_run_draws_its_trajectory_and_the_descriptors_of_its_first_match(world_map, world_run, tmp_path):
-    result = locate(world_map, open_run(world_run))
-    draw_run(result, world_map, tmp_path)
-    for path in (tmp_path / "trajectory.png", tmp_path / "descriptors.png"):
-        assert path.read_bytes().startswith(b"\x89PNG")
-        path.unlink()
-    result.fixes, result.winner = [Fix(0.0, State.SEARCHING)], None
-    draw_run(result, world_map, tmp_path)
-    assert [path.name for path in tmp_path.iterdir()] == ["trajectory.png"]

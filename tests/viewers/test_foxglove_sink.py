@@ -31,24 +31,30 @@ def shown(sink):
     sink.scan(Scan("r1", 6_000_000_000, POINTS, T))
 
 
+def recorded(path):
+    """Messages of a recording by topic, each as (stamp, name of the schema, bytes); and the rows of its map."""
+    reader = pytest.importorskip("mcap.reader", reason="mcap is not there; pip install mcap")
+    from foxglove_schemas_protobuf.PointCloud_pb2 import PointCloud
+
+    messages = {}
+    with path.open("rb") as stream:
+        for schema, channel, message in reader.make_reader(stream).iter_messages():
+            messages.setdefault(channel.topic, []).append((message.log_time, schema and schema.name, message.data))
+    return messages, np.frombuffer(PointCloud.FromString(messages["/map"][0][2]).data, "<f4").reshape(-1, 4)
+
+
 def test_recording_holds_every_topic_in_schemas_of_foxglove(tmp_path):
     sink = FoxgloveSink()
     sink.record(tmp_path / "a.mcap")
     shown(sink)
     sink.close()
-    reader = pytest.importorskip("mcap.reader", reason="mcap is not there; pip install mcap")
-    from foxglove_schemas_protobuf.PointCloud_pb2 import PointCloud
+    messages, rows = recorded(tmp_path / "a.mcap")
     from foxglove_schemas_protobuf.PosesInFrame_pb2 import PosesInFrame
 
-    messages = {}
-    with (tmp_path / "a.mcap").open("rb") as stream:
-        for schema, channel, message in reader.make_reader(stream).iter_messages():
-            messages.setdefault(channel.topic, []).append((schema and schema.name, message.data))
     assert set(messages) == TOPICS
-    assert messages["/map"][0][0] == "foxglove.PointCloud"
-    rows = np.frombuffer(PointCloud.FromString(messages["/map"][0][1]).data, "<f4").reshape(-1, 4)
+    assert messages["/map"][0][1] == "foxglove.PointCloud"
     np.testing.assert_array_equal(rows[:, :3], POINTS)
-    poses = PosesInFrame.FromString(messages["/robots/r1/hypotheses"][0][1]).poses
+    poses = PosesInFrame.FromString(messages["/robots/r1/hypotheses"][0][2]).poses
     assert [round(each.position.x, 3) for each in poses] == [12.0, 17.0]  # about the map's origin
     assert len(messages["/robots/r1/state"]) == 2
 
@@ -101,22 +107,16 @@ def world(folder):
 
 def test_recording_holds_survey_truth_scans_and_odometry_at_their_stamps(tmp_path):
     assert record_world(world(tmp_path / "world"), tmp_path / "a.mcap") == 3
-    reader = pytest.importorskip("mcap.reader", reason="mcap is not there; pip install mcap")
-    from foxglove_schemas_protobuf.PointCloud_pb2 import PointCloud
+    messages, rows = recorded(tmp_path / "a.mcap")
     from foxglove_schemas_protobuf.PoseInFrame_pb2 import PoseInFrame
 
-    messages = {}
-    with (tmp_path / "a.mcap").open("rb") as stream:
-        for _, channel, message in reader.make_reader(stream).iter_messages():
-            messages.setdefault(channel.topic, []).append((message.log_time, message.data))
     stamps = [10_000_000_000, 10_100_000_000, 10_200_000_000]
     for topic in ("/robots/truth/pose", "/robots/truth/scan", "/robots/odometry/pose"):
-        assert [stamp for stamp, _ in messages[topic]] == stamps
-    rows = np.frombuffer(PointCloud.FromString(messages["/map"][0][1]).data, "<f4").reshape(-1, 4)
+        assert [stamp for stamp, _, _ in messages[topic]] == stamps
     origin = read_cloud(tmp_path / "world" / "base.laz").origin
     assert np.abs(rows[:, :3] + origin - ORIGIN).max() < 20.1
     assert 0.3 < rows[:, 3].mean() < 0.7  # half of it is the ground
     for topic in ("/robots/truth/pose", "/robots/odometry/pose"):
-        last = PoseInFrame.FromString(messages[topic][-1][1]).pose.position
+        last = PoseInFrame.FromString(messages[topic][-1][2]).pose.position
         expected = (T_MAP_ODOM @ ODOMETRY[-1])[:3, 3] - origin
         np.testing.assert_allclose([last.x, last.y, last.z], expected, atol=1e-5)

@@ -2,7 +2,6 @@
 
 import json
 import threading
-import time
 
 import numpy as np
 import pytest
@@ -25,34 +24,23 @@ VIEW = MapView(np.zeros(3), np.ones((4, 3), dtype=np.float32), np.ones(4, dtype=
 
 
 class Kept(Sink):
+    """Keeps all that comes, by its kind."""
+
     def __init__(self):
-        self.seen = []
+        self.seen = {kind: [] for kind in ("map", "pose", "status", "hypotheses", "scan")}
+        self.map, self.pose = self.seen["map"].append, self.seen["pose"].append
+        self.hypotheses, self.scan = self.seen["hypotheses"].append, self.seen["scan"].append
         self.closed = False
 
-    def map(self, view):
-        self.seen.append(("map", view))
-
-    def pose(self, pose):
-        self.seen.append(("pose", pose))
-
     def status(self, robot, status):
-        self.seen.append(("status", (robot, status)))
-
-    def hypotheses(self, hypotheses):
-        self.seen.append(("hypotheses", hypotheses))
-
-    def scan(self, scan):
-        self.seen.append(("scan", scan))
+        self.seen["status"].append((robot, status))
 
     def close(self):
         self.closed = True
 
-    def wait(self, kind, count=1, seconds=10.0):
-        end = time.monotonic() + seconds
-        while len(found := [item for k, item in self.seen if k == kind]) < count and time.monotonic() < end:
-            time.sleep(0.005)
-        assert len(found) >= count, f"{kind}: {len(found)} of {count}"
-        return found
+    def wait(self, kind, count=1):
+        until(lambda: len(self.seen[kind]) >= count)
+        return self.seen[kind].copy()
 
 
 class Broken(Sink):

@@ -21,6 +21,7 @@ from coview_stream.viewers.web_page import WebPage
 
 pytestmark = pytest.mark.slow
 
+LEVEL, LATENCY = ProtectionLevel(2.5, 1.0, 2.0, 1.5), {"p50": 12.0, "p99": 34.0}
 TRACKING = [0, 114, 178]  # colour of the state in the light theme
 WRONG = "one place leads: wrong 1 in 2,300, 1 in 10,000 needed <b>&amp;"
 
@@ -53,30 +54,14 @@ class Streaming:
             yaw = 0.02 * k
             position = self.view.origin + np.array([-15.0 + 10.0 * np.cos(yaw), 10.0 * np.sin(yaw), 1.0])
             T = pose_from(rot_z(yaw), position)
-            pose = PoseMessage(
-                ns(0.1 * k),
-                "r1",
-                "TRACKING",
-                T,
-                0.01 * np.eye(6),
-                0.99999,
-                SHA,
-                0.1,
-                "map",
-                ProtectionLevel(2.5, 1.0, 2.0, 1.5),
-            )
+            pose = PoseMessage(ns(0.1 * k), "r1", "TRACKING", T, 0.01 * np.eye(6), 0.99999, SHA, 0.1, "map", LEVEL)
             if self.state == "TRACKING":
                 self._put(KEYS.pose, encode_pose(pose, "json"))
             else:
                 places = np.array([[*position, yaw, 0.6, 9.0], [*(position + 30.0), 1.0, 0.3, 8.0]])
                 self._put(KEYS.hypotheses, encode_hypotheses(HypothesesMessage(1, "r1", places, 0.1, SHA)))
             self.net.publish(cloud(0.1 * k, points))
-            status = {
-                "state": self.state,
-                "reason": self.reason,
-                "latency_ms": {"p50": 12.0, "p99": 34.0},
-                "map_sha256": SHA,
-            }
+            status = {"state": self.state, "reason": self.reason, "latency_ms": LATENCY, "map_sha256": SHA}
             self.net.publish(Sample(KEYS.status, json.dumps(status).encode(), "application/json"))
 
     def _put(self, key, encoded):
