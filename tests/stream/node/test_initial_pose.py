@@ -106,15 +106,7 @@ def test_guess_is_told_again_to_an_engine_that_begins_anew():
     assert robot.frame(0.3, unknown).guess is None
 
 
-@pytest.mark.parametrize(
-    "forget",
-    [
-        lambda session: session.reset(),
-        lambda session: session.reset(forget=False),
-        lambda session: session.restart_search("asked to search again", forget=True),
-    ],
-)
-def test_guess_that_waits_is_forgotten_with_the_rest(robot, forget):
+def test_guess_that_waits_is_forgotten_by_a_node_that_gives_the_robot_up(robot):
     assert robot.session.guess_place(PlaceGuess(1.0, 2.0, within=300.0))
-    forget(robot.session)
+    robot.session.reset(forget=False)
     assert robot.frame(0.0, unknown).guess is None

@@ -21,9 +21,9 @@ OTHER = "b" * 64
 
 
 class Change:
-    """A running node of robots, and another map that is opened for it."""
+    """A running node whose robots have places, and another map that is opened for it."""
 
-    def __init__(self, *names, max_handover=60.0):
+    def __init__(self, *names, max_handover=60.0, step=0):
         self.engine = Engine()
         self.runners = Runner(self.engine), Runner(self.engine)
         self.error, self.open_as = None, None
@@ -33,7 +33,7 @@ class Change:
         self.reloader = self.site.node.reloader
         self.reloader.max_handover = max_handover
         self.site.node.start()
-        self.step = 0
+        self.step = step
 
     def open(self, served, cancelled):
         if self.error is not None:
@@ -65,8 +65,9 @@ def changes():
     made = []
 
     def make(*names, **more):
-        made.append(Change(*names, **more))
-        return made[-1]
+        made.append(change := Change(*names, **more))
+        change.drive_until(lambda: change.states() == ["TRACKING"] * len(names))
+        return change
 
     yield make
     for change in made:
@@ -75,7 +76,6 @@ def changes():
 
 def test_robots_keep_the_old_map_until_the_new_one_has_verified_their_place(changes):
     change = changes("r1", "r2")
-    change.drive_until(lambda: change.states() == ["TRACKING"] * 2)
     old = change.maps()[0]
     before = change.site.node.sessions[0]
     change.engine.answer = unknown  # the new map does not know them yet
@@ -122,7 +122,6 @@ def test_flood_of_reloads_opens_the_map_once_a_second_and_is_one_line(changes, c
 
 def test_place_on_the_old_map_is_a_hypothesis_on_the_new_one(changes):
     change = changes("r1")
-    change.drive_until(lambda: change.states() == ["TRACKING"])
     hints = []
 
     def answer(job):
@@ -139,9 +138,7 @@ def test_place_on_the_old_map_is_a_hypothesis_on_the_new_one(changes):
 
 @pytest.mark.slow
 def test_robot_that_begins_anew_after_a_change_that_it_slept_through_has_poses_again(changes):
-    change = changes("r1", max_handover=0.1)
-    change.step = 5000
-    change.drive_until(lambda: change.states() == ["TRACKING"])
+    change = changes("r1", max_handover=0.1, step=5000)
     change.site.node.reload()
     until(lambda: change.reloader.last["result"] == "changed")
     session = change.site.node.sessions[0]
@@ -153,7 +150,6 @@ def test_robot_that_begins_anew_after_a_change_that_it_slept_through_has_poses_a
 
 def test_robot_that_the_new_map_does_not_know_is_searched_for_after_a_while(changes):
     change = changes("r1", max_handover=0.3)
-    change.drive_until(lambda: change.states() == ["TRACKING"])
     change.engine.answer = unknown
     change.site.node.reload()
     change.drive_until(lambda: change.reloader.last["result"] == "changed")
@@ -165,7 +161,6 @@ def test_robot_that_the_new_map_does_not_know_is_searched_for_after_a_while(chan
 @pytest.mark.parametrize("error", [MapError("it is damaged"), DiedError("it is damaged"), ValueError("it is damaged")])
 def test_map_that_cannot_be_used_changes_nothing(changes, error, caplog):
     change = changes("r1")
-    change.drive_until(lambda: change.states() == ["TRACKING"])
     old = change.maps()
     change.error = error
     change.site.node.reload()
@@ -180,7 +175,6 @@ def test_map_that_cannot_be_used_changes_nothing(changes, error, caplog):
 
 def test_node_that_ends_during_a_change_ends(changes):
     change = changes("r1")
-    change.drive_until(lambda: change.states() == ["TRACKING"])
     change.engine.answer = unknown
     change.site.node.reload()
     change.drive_until(lambda: change.engine.served)
