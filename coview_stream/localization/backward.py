@@ -1,8 +1,8 @@
-"""Tracking backwards: from a fix to the frames before it, once a run is recorded.
+"""Backward tracking of a recorded run, from a fix to the frames before it.
 
-Frames before the first fix and within interruptions have no live pose. Once a later fix is known they are tracked in
-reverse: the same registration, verification and loss monitor, with the clock running backwards. So a slip, a robot
-that was carried or odometry that began anew ends it just as it ends live tracking.
+Frames before the first fix and within interruptions have no live pose. A later fix allows to track them in reverse, by
+the same registration, verification and loss monitor. So a slip, a carried robot or restarted odometry ends backward
+tracking as it ends live tracking.
 """
 
 from __future__ import annotations
@@ -34,12 +34,12 @@ class BelievedRegistration:
     """A verified registration of one frame.
 
     Attributes:
-        T_map_cloud: (4, 4) of the cloud in the sensor's axes, about the map's origin, the prior removed.
+        T_map_cloud: (4, 4) of the cloud in the sensor's axes, about the map's origin, without the prior.
         covariance: (6, 6) over (rx, ry, rz, x, y, z), map axes, of this registration alone.
-        shared: (6, 6) likewise, of the error that neighbouring registrations share, but for mount and clock.
-        doubt: times as wide as usual its protection level is.
-        slipped: odometry has slipped since the registration before it, in the order of tracking.
-        backward: tracked backwards.
+        shared: (6, 6) likewise, of the error shared with neighbouring registrations, without mount and clock.
+        doubt: factor on the usual protection level.
+        slipped: odometry has slipped since the previous registration, in the order of tracking.
+        backward: whether it comes from backward tracking.
     """
 
     T_map_cloud: Pose
@@ -55,12 +55,12 @@ class RecordedFrame:
     """One usable frame of a run, with the results of tracking.
 
     Attributes:
-        index: in the run.
-        T_odom_body: (4, 4) odometry as it came.
+        index: of the frame in the run.
+        T_odom_body: (4, 4) raw odometry.
         origin: (3,) of its cloud, zero unless a single scan is stored far from its zero.
-        fix: live.
-        registered: the frame's registration, live or backwards; None without one.
-        backward: the fix of the backward pass; None if it had no pose, or there was none.
+        fix: the live fix.
+        registered: registration of the frame, live or backward; None without one.
+        backward: fix of the backward pass; None without a pose.
     """
 
     index: int
@@ -72,7 +72,7 @@ class RecordedFrame:
 
 
 class RecordingLocalizer(Localizer):
-    """Localizer that keeps the newest frame's registration, and can begin at a known place.
+    """Localizer that keeps the registration of the newest frame and can start at a known place.
 
     Attributes:
         registered: believed registration of the newest frame; None without one.
@@ -90,7 +90,7 @@ class RecordingLocalizer(Localizer):
         self, T_map_cloud: Pose, confidence: float, calibration: Calibration, cloud: Points, T_odom_body: Pose,
         stamp: float,
     ) -> None:  # fmt: skip
-        """Forget everything and track from the registered pose of a frame; its arguments as of :meth:`step`."""
+        """Reset, then track from a frame's registered pose (4, 4); the other arguments as in :meth:`step`."""
         self.reset()
         self._slipped, self._backward = False, True
         calibration = replace(calibration, delay=-calibration.delay)  # time runs backwards
@@ -110,9 +110,9 @@ class RecordingLocalizer(Localizer):
         )  # fmt: skip
 
     def fit(self, cloud: Points, T_map_body: Pose, calibration: Calibration) -> float:
-        """Share of a frame's structure that is on the map at a pose (4, 4) of its body; 0 for too little.
+        """Return the share of a frame's structure on the map at a body pose (4, 4); 0 for too few points.
 
-        The cloud (N, 3) is in the sensor's axes, and ``calibration`` the one that the pose was made with.
+        The cloud (N, 3) is in the sensor's axes; ``calibration`` is the one that the pose was computed with.
         """
         target = self._local_maps.around(T_map_body[:3, 3])
         points = transform(pose_from(T_map_body[:3, :3], np.zeros(3)), calibration.level(cloud))
@@ -125,9 +125,8 @@ class RecordingLocalizer(Localizer):
         self._slipped |= match.moves_place
         if ruling.believed and not (match.moves_place or self._tracker.risen):
             covariance = match.covariance.copy()
-            covariance[5, 5] += (
-                self._tracker.change.others.variance + self._tracker.change.alone
-            )  # heights that were possible then
+            # the heights that were possible then
+            covariance[5, 5] += self._tracker.change.others.variance + self._tracker.change.alone
             level = self._tracker.protection_level()
             shared = swap_rotation_translation(self._tracker.reported_covariance(mount_and_clock=False))
             shared -= self._tracker.predicted_covariance()
@@ -142,10 +141,10 @@ def track_backward(
     localizer: RecordingLocalizer, run: Run, frames: Sequence[RecordedFrame], begin: int, stop: int,
     calibration: Calibration,
 ) -> None:  # fmt: skip
-    """Track from the registered frame ``begin`` back to the one after ``stop``; note poses and registrations.
+    """Track from the registered frame ``begin`` back to the frame after ``stop``; store poses and registrations.
 
-    Poses before the earliest registration are kept only at the run's beginning (``stop`` is -1): elsewhere tracking
-    ended in doubt, or meets live tracking there.
+    Poses before the earliest registration are kept only at the start of the run (``stop`` is -1): elsewhere tracking
+    ended in doubt or meets live tracking.
     """
     start = frames[begin]
     assert start.registered is not None

@@ -1,4 +1,4 @@
-"""Preparation of frames: the checks of a frame, and its odometry corrected by the calibration."""
+"""Preparation of frames: validation, and correction of odometry by the calibration."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from coview_stream.localization.calibration.frame_motion import FrameMotion, Var
 from coview_stream.localization.calibration.odometry_history import Moment
 from coview_stream.localization.witness.first_motions import Conventions
 
-_PLACE_TILT = math.radians(0.5)  # sigma of roll and pitch of a frame that is registered at the right place
+_PLACE_TILT = math.radians(0.5)  # sigma of roll and pitch of a frame registered at the right place
 
 
 @dataclass(frozen=True)
@@ -27,8 +27,8 @@ class PreparedFrame:
 
     Attributes:
         cloud: (N, 3) float32, the sensor's own axes.
-        T_odom_body: (4, 4) corrected odometry of the cloud's moment, about the anchor.
-        T_odom_raw: (4, 4) odometry as it came, of the stamp.
+        T_odom_body: (4, 4) corrected odometry at the moment of the cloud, about the anchor.
+        T_odom_raw: (4, 4) raw odometry at the stamp.
         stamp: seconds.
         scan: one point per voxel.
     """
@@ -41,12 +41,12 @@ class PreparedFrame:
 
 
 class FramePreparation:
-    """Preparation of a robot's frames, and the estimate of its calibration.
+    """Preparation of a robot's frames, with the estimate of its calibration.
 
     Attributes:
         estimator: of the calibration; learns from registrations too.
-        conventions: judge of units and axes.
-        anchor: (3,) origin of the odometry in use: near it float32 is exact; None before the first frame.
+        conventions: check of units and axes.
+        anchor: (3,) origin of the current odometry, near which float32 is exact; None before the first frame.
     """
 
     def __init__(self, config: LocalizerConfig) -> None:
@@ -64,7 +64,7 @@ class FramePreparation:
         return self.estimator.calibration
 
     def restart(self) -> None:
-        """Go on in another frame of odometry, with the same calibration."""
+        """Continue in another odometry frame, with the same calibration."""
         self.estimator.begin_odometry()
         self.conventions.clear()
         self._odometry = OdometryCorrection()
@@ -72,23 +72,19 @@ class FramePreparation:
         self.anchor = self._newest = None
 
     def forget_odometry(self) -> None:
-        """Connect the next frame with none before it: odometry may have jumped."""
+        """Keep the next frame unconnected to earlier ones, as odometry may have jumped."""
         self.forget_keyframe()
         self.anchor = None
 
     def forget_keyframe(self) -> None:
-        """Measure no motion from the newest keyframe to the next."""
+        """Measure no motion from the newest keyframe to the next one."""
         self._motion.clear()
 
     def prepare(self, cloud: Points, T_odom_body: Pose, stamp: float, drift: Variances | None = None) -> PreparedFrame:
-        """Check and correct a frame.
+        """Validate and correct a frame; its arguments as in ``Localizer.step``.
 
-        Args:
-            cloud: as of :meth:`coview_stream.localization.localizer.Localizer.step`.
-            T_odom_body: likewise.
-            stamp: likewise.
-            drift: of odometry, to correct a keyframe's motion by its registration to the last keyframe. None while a
-                place is known, as registrations to the map measure the motion better.
+        ``drift`` is odometry's, to correct the motion of a keyframe by registration to the previous keyframe. It is
+        None while a place is known, as registrations to the map measure the motion better.
 
         Raises:
             CloudError, RunError: the frame is unusable; nothing has changed.
@@ -114,20 +110,20 @@ class FramePreparation:
         return PreparedFrame(raw, T, T_raw, stamp, RawScan(points, T, self.calibration, moment))
 
     def knows_moment(self, stamp: float) -> bool:
-        """Return whether odometry goes back to when the cloud of a stamp was measured, but for the delay's sigmas."""
+        """Return whether odometry covers the moment at which the cloud was measured, within 2 sigma of the delay."""
         late = self.calibration.delay - 2.0 * self.calibration.sigma_delay
         return late <= 0.0 or self.estimator.history.covers(stamp - late, stamp)
 
     def since_cloud(self, stamp: float) -> Pose:
-        """Return the body's motion (4, 4) from the moment of a cloud, which may be late, to its stamp, corrected.
+        """Return the corrected motion (4, 4) of the body from the moment of a cloud, which may be late, to its stamp.
 
-        Where odometry is late instead the cloud's moment is the stamp.
+        Where odometry is the late one, the moment of the cloud is its stamp.
         """
         now = self.calibration
         return np.asarray(self.estimator.history.since_clouds(np.array([stamp]), now.delay, now.scale)[0])
 
     def learn_place(self, T_map_cloud: Pose, T_odom_body: Pose, probability: float | None = None) -> Pose:
-        """Learn the tilt from a place of the search; return its ``T_map_odom`` (4, 4) by the new calibration.
+        """Learn the tilt from a place of the search; return its ``T_map_odom`` (4, 4) with the new calibration.
 
         Args:
             T_map_cloud: (4, 4) registered pose of a keyframe's cloud in the sensor's own axes.
@@ -145,18 +141,18 @@ class FramePreparation:
 
 
 class OdometryCorrection:
-    """Correction of odometry's scale and heading, step by step; turns are about the vertical.
+    """Incremental correction of odometry's scale and heading (about the vertical).
 
-    A corrected step does not change when the calibration does.
+    A later calibration does not change steps that are already corrected.
     """
 
     def __init__(self) -> None:
-        self._before: Pose | None = None  # not corrected
+        self._before: Pose | None = None  # raw
         self._position = np.zeros(3)
         self._turned = 0.0
 
     def correct(self, T_odom_body: Pose, calibration: Calibration, before: Pose | None = None) -> Pose:
-        """Return the next pose (4, 4), odometry <- body, corrected; ``before`` replaces the previous one."""
+        """Return the next corrected pose (4, 4), odometry <- body; raw pose ``before`` replaces the previous one."""
         if self._before is not None and before is not None:
             self._before = before
         if self._before is None:
@@ -171,8 +167,8 @@ class OdometryCorrection:
         return self._corrected(T_odom_body)
 
     def move_to(self, T_odom_body: Pose) -> Pose:
-        """Go on from another pose (4, 4) than the newest corrected pose; roll and pitch stay odometry's."""
-        assert self._before is not None  # there is a newest one
+        """Replace the newest corrected pose by another one (4, 4); roll and pitch stay odometry's."""
+        assert self._before is not None  # there is a newest pose
         now = self._corrected(self._before)
         self._turned += float(log_so3(T_odom_body[:3, :3] @ now[:3, :3].T)[2])
         self._position = T_odom_body[:3, 3].copy()

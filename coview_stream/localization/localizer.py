@@ -38,13 +38,13 @@ _DEFERRED = 3.0  # factor on the metres and seconds between deferred registratio
 
 
 class Localizer(SavedState):
-    """Localization of one robot on a base map (paper, eqs 1-13, and a graph of poses from the first fix on).
+    """Localization of one robot on a base map (paper, eqs 1-13, and a pose graph from the first fix on).
 
     Attributes:
         base_map: the map; may be shared by many localizers.
-        config: how decisions are made.
+        config: settings of the decisions.
         state: of the newest fix.
-        search: has the names of its recognizers (``names``) and the newest descriptors (``last_query``).
+        search: with the names of its recognizers (``names``) and the newest descriptors (``last_query``).
     """
 
     def __init__(
@@ -58,15 +58,15 @@ class Localizer(SavedState):
 
         Args:
             base_map: the map, or the path of its ``.coview`` file, which is loaded and checked.
-            config: how decisions are made; None takes the defaults.
-            local_maps: cache of crops of the map; localizers of one thread may share it.
+            config: settings of the decisions; None takes the defaults.
+            local_maps: cache of map crops; localizers of one thread may share it.
             index: of the search; may be shared likewise.
 
         Raises:
-            ConfigError: ``config`` is something else.
-            InputError: ``base_map`` is something else.
+            ConfigError: ``config`` has another type.
+            InputError: ``base_map`` has another type.
             MapError: the file cannot be loaded.
-            MapError, InputError: ``config.reloc`` is ``learned``, and that cannot be used here.
+            MapError, InputError: ``config.reloc`` is ``learned``, which cannot be used here.
         """
         self.base_map, self.config = checked_arguments(base_map, config)
         self._local_maps = local_maps or LocalMaps(self.base_map, self.config.registration.source_range)
@@ -75,18 +75,16 @@ class Localizer(SavedState):
         self.reset()
 
     def reset(self, epoch: int = 0) -> None:
-        """Forget everything but the map; ``epoch`` numbers the odometry frame that follows."""
+        """Forget everything but the map; ``epoch`` is the number of the next odometry frame."""
         self._frames = FramePreparation(self.config)
         self._tracker = Tracker(self.base_map, self.config, self._local_maps, self._frames.estimator)
         self.relocalize(epoch)
 
     def relocalize(self, epoch: int | None = None) -> None:
-        """Forget the place and search the whole map again: the next fixes have no pose until a place is accepted.
+        """Forget the place and search the whole map: the next fixes have no pose until a place is accepted.
 
-        The calibration of sensor and odometry and the site's ground offset stay.
-
-        Args:
-            epoch: number of the odometry frame that follows; None if odometry goes on.
+        The calibration of sensor and odometry and the site's ground offset stay. ``epoch`` is the number of the next
+        odometry frame; None if odometry continues.
         """
         odometry = self._requests.epoch.odometry if epoch is None else epoch
         ground = self._tracker.ground.metres
@@ -104,7 +102,7 @@ class Localizer(SavedState):
         self._newest: PreparedFrame | None = None
         self._evidence: KeyframeEvidence | None = None
         self._confidence = 0.0  # of the search's acceptance
-        self._wrong = 0.0  # probability of a wrong place, by the newest registration
+        self._wrong = 0.0  # probability that the place is wrong, by the newest registration
         self._registered_at = 0.0  # stamp of the newest registration
 
     def __repr__(self) -> str:
@@ -126,26 +124,26 @@ class Localizer(SavedState):
 
     @property
     def sensor_fault(self) -> float:
-        """Probability that clouds or odometry have a fault, by the newest comparison."""
+        """Probability of a fault in clouds or odometry, by the newest comparison."""
         return 1.0 if self._frames.conventions.finding is not None else self._witness.faults.sensors
 
     def prepare(self) -> None:
-        """Do the work that the first search and the first registrations would wait for: some seconds, once.
+        """Load and compile ahead of the first search and registrations: some seconds, once.
 
         Raises:
             InputError: the network of the learned features cannot be loaded.
         """
-        kernels.warm_up(*GlobalSearch.KERNELS, "nearest")  # tracking needs this one too
+        kernels.warm_up(*GlobalSearch.KERNELS, "nearest")  # tracking needs "nearest" too
         self.search.prepare()
 
     # ---- one frame
 
     def step(self, cloud: Reals, T_odom_body: Pose, stamp: float) -> Fix:
-        """Localize by one more frame; docs/method.md has the steps.
+        """Localize one more frame; docs/method.md describes the steps.
 
         Args:
             cloud: (N, 3) float32 or float64 body-frame points (x forward, z up), deskewed, metres, or (N, 4) with
-                intensities that are not used; rows with NaN are dropped.
+                unused intensities; rows with NaN are dropped.
             T_odom_body: (4, 4) odometry pose of the frame, gravity aligned, metres.
             stamp: seconds.
 
@@ -169,18 +167,18 @@ class Localizer(SavedState):
         self, cloud: Reals, T_odom_body: Pose, stamp: float, defer: bool = False,
         on_doubt: Callable[[], None] = lambda: None,
     ) -> SearchRequest | None:  # fmt: skip
-        """:meth:`step` without the search: its arguments, and its errors.
+        """Process a frame as :meth:`step` does, with its errors, but without the search.
 
         Args:
-            cloud: see there.
-            T_odom_body: see there.
-            stamp: see there.
-            defer: the caller is behind: while tracking, register every third metre where that is enough.
-            on_doubt: called if the frame contradicts the place, some tenths of a second before it is known why.
+            cloud: see :meth:`step`.
+            T_odom_body: see :meth:`step`.
+            stamp: see :meth:`step`.
+            defer: the caller is behind: while tracking, register every third metre where that suffices.
+            on_doubt: called if the frame contradicts the place, some tenths of a second before the cause is known.
 
         Returns:
-            The search request, if any: give it to a :class:`GlobalSearch`, in any thread or process, and its result to
-            :meth:`apply_search_result` between two frames. Frames go on meanwhile. ``AsyncLocalizer`` does all of it.
+            The search request, if any: pass it to a :class:`GlobalSearch` in any thread or process, and its result to
+            :meth:`apply_search_result` between two frames. Frames continue meanwhile. ``AsyncLocalizer`` does all this.
         """
         frame, request = self._predict(cloud, T_odom_body, stamp)
         match = self._match_to_map(frame, defer, on_doubt) if self.state.has_place else None
@@ -189,9 +187,9 @@ class Localizer(SavedState):
         return request
 
     def apply_search_result(self, result: SearchResult) -> None:
-        """Track the place that a search has accepted, or note why it has accepted none.
+        """Track the place that a search has accepted, or record why it accepted none.
 
-        A result from before a loss or a :meth:`reset` is ignored, as are all results while a place is known.
+        Results from before a loss or a :meth:`reset` are ignored, as are all results while a place is known.
         """
         newest = self._newest
         if result.epoch != self._requests.epoch or self.state.has_place or newest is None:
@@ -249,7 +247,7 @@ class Localizer(SavedState):
         )
 
     def take_events(self) -> tuple[Event, ...]:
-        """Return the events that have changed the state since the last call, in order; :meth:`reset` drops them."""
+        """Return the events that changed the state since the last call, in order; :meth:`reset` drops them."""
         events, self._events = tuple(self._events), []
         return events
 
@@ -258,32 +256,31 @@ class Localizer(SavedState):
     def hint_pose(self, T_map_body: Pose) -> None:
         """Hint that the robot may be here at the next frame; holds until a place is accepted or :meth:`reset`.
 
-        A hint is never trusted: the search judges it like the last hypothesis of the votes. Ignored while a place is
-        known.
+        The search judges a hint like the last hypothesis of the votes. Hints are ignored while a place is known.
 
         Args:
             T_map_body: (4, 4) as :attr:`Fix.T_map_body`.
 
         Raises:
-            RunError: it is not a finite rigid transform, or no place on this planet.
+            RunError: it is not a finite rigid transform, or not on this planet.
         """
         local = validate_pose(T_map_body, self.base_map.origin)
         if not self.state.has_place:
             self._requests.hints.robot_at(local)
 
     def guess_place(self, guess: PlaceGuess, check: bool = True) -> None:
-        """Have the search try a guess of the robot's place, from the next frame on.
+        """Let the search try a guess of the robot's place, from the next frame on.
 
-        A guess is never trusted: its poses are judged like the descriptors' hypotheses. But ``guess.within`` limits the
-        search to a circle, widened by the metres driven, until a place is accepted, another guess comes or the search
-        starts again (:meth:`relocalize`). Ignored while a place is known.
+        The search judges the poses of a guess like the descriptors' hypotheses. But ``guess.within`` limits the search
+        to a circle, widened by the metres driven, until a place is accepted, another guess comes or the search restarts
+        (:meth:`relocalize`). Guesses are ignored while a place is known.
 
         Args:
             guess: of the place.
-            check: refuse a guess where the map has no ground; without, such a circle ends in no pose.
+            check: refuse a guess where the map has no ground; unchecked, such a circle never leads to a pose.
 
         Raises:
-            InputError: it is no guess, or the map has no ground there.
+            InputError: ``guess`` has another type, or the map has no ground there.
         """
         if check:
             require_ground(guess, self.base_map)
@@ -291,12 +288,12 @@ class Localizer(SavedState):
             self._requests.guess(guess)
 
     def hint_calibration(self, earlier: Calibration) -> None:
-        """Begin with an earlier calibration of this robot, less certain, and go on measuring it.
+        """Start from an earlier calibration of this robot, with larger sigmas, and continue to estimate it.
 
         Ignored while a place is known, and where the present calibration is more certain.
 
         Raises:
-            InputError: a value is not finite or none of a robot.
+            InputError: a value is not finite or not plausible for a robot.
         """
         earlier.require_plausible()
         if self.state.has_place:
@@ -306,7 +303,7 @@ class Localizer(SavedState):
             self._tracker.ground.restore(earlier.ground)
 
     def require_verification(self) -> None:
-        """Give no pose until new frames alone have verified the place: the robot may have been carried."""
+        """Withhold poses until new frames alone have verified the place, as the robot may have been carried."""
         self._tracker.forget_scans()
         self._monitor.require_verification()
         self._handle(Event.VERIFICATION_REQUIRED)
@@ -319,9 +316,9 @@ class Localizer(SavedState):
         drift = self._tracker.odometry.drift.variances if searching else None
         frame = self._newest = self._frames.prepare(cloud, T_odom_body, stamp, drift)
         self._tracker.add_scan(frame.scan)
-        if (finding := self._frames.conventions.finding) is not None:  # nothing of this sender can be believed
+        if (finding := self._frames.conventions.finding) is not None:  # nothing from this sender can be believed
             self._handle(Event.PLACE_GIVEN_UP)
-            self._requests.begin_anew()  # a search may be under way
+            self._requests.begin_anew()  # a search may be running
             self._evidence = KeyframeEvidence(stamp, self.state, finding, cause=RejectionReason.CONVENTIONS)
             return frame, None
         self._witness.add(stamp, frame.cloud, frame.scan, frame.T_odom_raw)
@@ -336,7 +333,7 @@ class Localizer(SavedState):
                 reason, cause = accused.sentence, accused.cause
             self._evidence = KeyframeEvidence(stamp, self.state, reason, cause=cause)
             return frame, None
-        if accused is not None:  # no place is found by clouds that may lie
+        if accused is not None:  # no place is searched by clouds that may be wrong
             self._requests.begin_anew()
             self._evidence = KeyframeEvidence(stamp, self.state, accused.sentence, cause=accused.cause)
             return frame, None
@@ -357,7 +354,7 @@ class Localizer(SavedState):
     def _match_to_map(
         self, frame: PreparedFrame, defer: bool = False, on_doubt: Callable[[], None] = lambda: None
     ) -> MapMatch | None:
-        """Register the newest scans after a metre, a second, or when something looks wrong."""
+        """Register the newest scans if due: after a metre, a second, or when they look displaced."""
         if self._frames.conventions.doubtful:
             return None
         patience = _DEFERRED if defer else 1.0
@@ -371,9 +368,9 @@ class Localizer(SavedState):
         return None
 
     def _update(self, match: MapMatch) -> Ruling:
-        """Judge a registration, correct the pose by one that is believed, and change the state; return the ruling.
+        """Judge a registration, correct the pose if it is believed, and change the state; return the ruling.
 
-        The next fix has its evidence, unless it only confirms the search's.
+        The next fix has the registration's evidence, unless it only confirms the search's.
         """
         assert self._newest is not None  # the match is of the newest frame
         belief = self._tracker.belief if self.state is State.TRACKING else None
@@ -402,7 +399,7 @@ class Localizer(SavedState):
             return
         self._events.append(event)
         if self.state is State.LOST:
-            # odometry may have jumped, or the sensor or the map is wrong: then odometry's way is worth a try
+            # odometry may have jumped, or the sensor or the map is wrong: then odometry's path is worth a try
             self._requests.place_lost(self._tracker.T_map_odom)
             self._frames.forget_odometry()
             self._tracker.ground.restore(self._tracker.ground.metres)
@@ -413,10 +410,7 @@ class Localizer(SavedState):
 def checked_arguments(
     base_map: BaseMap | str | os.PathLike[str], config: LocalizerConfig | None
 ) -> tuple[BaseMap, LocalizerConfig]:
-    """Return the map, loaded if it is a path, and the settings, or the defaults.
-
-    ConfigError, InputError, MapError: as of :class:`Localizer`.
-    """
+    """Return the map, loaded if it is a path, and the settings or the defaults; errors as in :class:`Localizer`."""
     if not isinstance(config, LocalizerConfig | None):
         kind = type(config).__name__
         raise ConfigError(f"config is a {kind}; give a LocalizerConfig, such as LocalizerConfig(reloc='coview')")

@@ -39,10 +39,10 @@ _KINDS = {
     PoseKind.BACKWARD: "tracked backwards from a later fix",
     PoseKind.BRIDGED: "bridged by odometry",
 }
-_TOLD = 3  # stretches without a pose that a summary names
+_TOLD = 3  # interruptions that a summary lists
 
 TRAJECTORY, FILTERED = "trajectory.tum", "filtered.tum"
-"""Trajectories of a run: the best, and with smoothing the live one beside it."""
+"""Trajectories of a run: the best one and, with smoothing, the live one beside it."""
 
 TRAJECTORY_PNG, DESCRIPTORS_PNG = "trajectory.png", "descriptors.png"
 """Pictures of a run; ``report.run_pictures`` draws them."""
@@ -50,13 +50,13 @@ TRAJECTORY_PNG, DESCRIPTORS_PNG = "trajectory.png", "descriptors.png"
 
 @dataclass(frozen=True)
 class Interruption:
-    """Frames with a reason: those after the first fix that have no pose, or those that were told of a fault.
+    """Frames with a common reason: without a pose after the first fix, or with a reported fault.
 
     Attributes:
         first: stamp of the first frame, seconds.
         last: stamp of the last frame.
         frames: number of frames.
-        reason: of most of them.
+        reason: of most frames.
     """
 
     first: float
@@ -71,14 +71,14 @@ class Interruption:
 
 @dataclass(frozen=True)
 class Stretch:
-    """Successive smoothed poses of one kind; frames without a pose may lie between.
+    """Successive smoothed poses of one kind; frames without a pose may lie between them.
 
     Attributes:
         kind: of the poses.
         first: stamp of the first frame, seconds.
         last: stamp of the last frame.
         frames: number of poses.
-        protection_m: their greatest protection level, metres.
+        protection_m: greatest protection level of the poses, metres.
     """
 
     kind: PoseKind
@@ -101,16 +101,16 @@ class RunResult:
         frames: number of frames in the run.
         fixes: one per usable frame, in order.
         keyframes: evidence of every keyframe.
-        skipped: file and reason of every frame that could not be used.
-        seconds: time of each step; empty if not known.
+        skipped: file and reason of every unusable frame.
+        seconds: duration of each step; empty if unknown.
         query: descriptors of the keyframe of the first fix, if any.
         winner: evidence of that keyframe.
-        sources: recognizers that named places: "coview", "learned"; empty if not known.
-        driven: metres that odometry had driven at the first fix; None if not known.
+        sources: recognizers that named places: "coview", "learned"; empty if unknown.
+        driven: metres of odometry up to the first fix; None if unknown.
         mount: of the run's lidar; None for the body itself.
-        smoothed: poses by the whole run, in order; None unless they were asked for.
+        smoothed: poses by the whole run, in order; None unless requested.
         considered: places of the newest search, if no frame has a pose; else None.
-        node_reason: why there was no pose, as a node said; empty if none was asked.
+        node_reason: why there was no pose, as reported by a node; empty without a node.
     """
 
     frames: int
@@ -129,7 +129,7 @@ class RunResult:
 
     @property
     def reason(self) -> str:
-        """Why no frame has a pose; empty if one has, or if nothing is known."""
+        """Why no frame has a pose; empty if one has, or if the reason is unknown."""
         if self.posed:
             return ""
         return self.node_reason or (self.keyframes[-1].reason if self.keyframes else "")
@@ -141,12 +141,12 @@ class RunResult:
 
     @property
     def filtered(self) -> tuple[Floats, Poses]:
-        """Stamps (P,) and poses (P, 4, 4) map <- body as they were live, of the frames that had one."""
+        """Stamps (P,) and live poses (P, 4, 4) map <- body, of the frames that had one."""
         return _trajectory(self.posed)
 
     @property
     def trajectory(self) -> tuple[Floats, Poses]:
-        """The same by the whole run, if it is :attr:`smoothed`."""
+        """Stamps and poses likewise, :attr:`smoothed` where the run is, else live."""
         return self.filtered if self.smoothed is None else _trajectory(self.smoothed)
 
     @property
@@ -164,7 +164,7 @@ class RunResult:
 
     @property
     def calibration(self) -> Calibration | None:
-        """The run's last calibration, posed or not; None if there was none."""
+        """The run's last calibration, with or without a pose; None if there was none."""
         return self.fixes[-1].calibration if self.fixes else None
 
     @property
@@ -179,7 +179,7 @@ class RunResult:
 
     @property
     def interruptions(self) -> list[Interruption]:
-        """Where poses are missing after the first fix, in order; skipped frames do not count."""
+        """Interruptions after the first fix, in order; skipped frames do not count."""
         gaps: list[list[Fix]] = []
         fixed, going_on = False, False
         for fix in self.fixes:
@@ -193,7 +193,7 @@ class RunResult:
 
     @property
     def faults(self) -> dict[RejectionReason, Interruption]:
-        """Faults of clouds and odometry that frames were told of, posed or not: first, last and number of frames."""
+        """Faults of clouds and odometry by cause, with the first, last and number of frames, with or without a pose."""
         told: dict[RejectionReason, list[Fix]] = {}
         for fix in self.fixes:
             if fix.evidence is not None and fix.evidence.cause in FAULTS:
@@ -206,7 +206,7 @@ class RunResult:
     def to_json(self, base_map: BaseMap) -> dict[str, Any]:
         """Plain data of ``result.json``: poses map <- body and map <- odom, seconds, metres.
 
-        ``confidence`` is the first fix's: that of the search that accepted the place.
+        ``confidence`` is the one of the search that accepted the first fix's place.
         """
         last = self.posed[-1] if self.posed else None
         evidence = self.fixes[-1].evidence if self.fixes else None
@@ -243,21 +243,21 @@ def locate(
     guess: PlaceGuess | None = None,
     smooth: bool = False,
 ) -> RunResult:
-    """Feed a run through a :class:`Localizer`, frame by frame, without looking ahead; then perhaps smooth it.
+    """Feed a run through a :class:`Localizer`, frame by frame, without looking ahead; then smooth it on request.
 
-    A frame that cannot be read is skipped and noted.
+    A frame that cannot be read is skipped and recorded.
 
     Args:
         base_map: the map.
         run: the run.
         config: of the localizer.
-        progress: called with the number of finished frames, of all frames, and the newest fix.
-        guess: of the place at the first frame; tried, and only its circle is trusted.
-        smooth: add poses by the whole run, also of frames that had none live (``smoothed``).
+        progress: called with the number of finished frames, the number of all frames, and the newest fix.
+        guess: of the place at the first frame; only its circle is trusted.
+        smooth: add poses by the whole run, also of frames without a live pose (``smoothed``).
 
     Raises:
-        InputError: no frame could be used (the message ends with the first frame's), or the map has no ground at the
-            guess.
+        InputError: no frame could be used (the message ends with the first frame's error), or the map has no ground at
+            the guess.
     """
     if run.mount is not None and not run.mount.drawn:
         config = replace(config or LocalizerConfig(), mount_drawn=False)
@@ -274,7 +274,7 @@ def locate(
             begin = time.perf_counter()
             fix = localizer.step(frame.points, frame.T_odom_body, frame.stamp)
         except (CloudError, RunError) as error:
-            path = run.frames_paths[index]  # which the localizer does not know
+            path = run.frames_paths[index]  # unknown to the localizer
             located.skipped.append(str(error) if path.name in str(error) else f"{path}: {error}")
             if progress:
                 progress(index + 1, len(run), None)
@@ -307,12 +307,12 @@ def locate(
 def from_stream(
     stamps: Sequence[float], poses: Sequence[dict[str, Any]], statuses: Sequence[dict[str, Any]]
 ) -> RunResult:
-    """Sort a node's published messages (JSON poses and statuses) under a run's frames, by stamp in seconds.
+    """Assign a node's published messages (JSON poses and statuses) to a run's frames, by stamp in seconds.
 
-    A frame has a pose if one was published for its stamp; a stamp that was published twice counts once. Another frame
-    has the state of the newest status before it.
+    A frame has a pose if one was published for its stamp; duplicate stamps count once. Other frames have the state of
+    the newest earlier status.
     """
-    pose_at = {round(p["stamp_ns"] / 1000): p for p in poses}  # stamps of runs are good to a microsecond
+    pose_at = {round(p["stamp_ns"] / 1000): p for p in poses}  # stamps of runs are exact to a microsecond
     states = sorted((s["last_frame_ns"] or 0, s["state"]) for s in statuses)
     located = RunResult(len(stamps))
     for stamp in stamps:
@@ -323,7 +323,7 @@ def from_stream(
         else:
             T = pose_from_tum([*pose["position"], *pose["orientation"]])
             covariance = np.array(pose["covariance"], dtype=np.float64).reshape(6, 6)
-            known_level = pose.get("protection_level")  # older nodes give none
+            known_level = pose.get("protection_level")  # older nodes send none
             level = None if known_level is None else ProtectionLevel(*(known_level[name] for name in LEVELS))
             confidence = float(pose["confidence"])
             located.fixes.append(Fix(stamp, State.TRACKING, T, None, covariance, confidence, protection=level))
@@ -338,7 +338,7 @@ def from_stream(
 
 
 def _dropped(counters: dict[str, int], frames: int) -> str:
-    """Return a clause on the work for which a node's machine was too slow; empty if there was none."""
+    """Return a clause on the work that a node's machine dropped for lack of time; empty if there was none."""
     searches = counters["searches"] + counters["searches_skipped"]
     parts = [
         (counters["dropped"], frames, "frames"),
@@ -351,7 +351,7 @@ def _dropped(counters: dict[str, int], frames: int) -> str:
 def write(located: RunResult, base_map: BaseMap, out: str | os.PathLike[str]) -> None:
     """Write ``trajectory.tum`` (posed frames only) and ``result.json`` into ``out``; remove an earlier run's pictures.
 
-    With smoothed poses the trajectory has these, and ``filtered.tum`` the live ones.
+    A smoothed run has its smoothed poses there, and the live ones in ``filtered.tum``.
 
     Raises:
         InputError: the directory cannot be written.
@@ -373,7 +373,7 @@ def write(located: RunResult, base_map: BaseMap, out: str | os.PathLike[str]) ->
 
 
 def summary(located: RunResult) -> str:
-    """Sum up a result in a few lines for a person."""
+    """Summarize a result in a few lines for people."""
     posed = located.posed
     share = f"{len(posed)} of {counted(located.frames, 'frame')}"
     lines = [f"{'state':<18} {located.state.reported}", f"{'localized':<18} {share}"]
@@ -413,14 +413,14 @@ def _trajectory(posed: Sequence[Fix] | Sequence[SmoothedPose]) -> tuple[Floats, 
 
 
 def _usual_reason(gap: Sequence[Fix]) -> str:
-    """Return the newest reason with the cause of most of the frames: at first the cause may not be clear."""
+    """Return the newest reason that has the most frequent cause: at first the cause may not be clear."""
     reasons = [(fix.state.reported, None) if (e := fix.evidence) is None else (e.reason, e.cause) for fix in gap]
     cause = Counter(cause for _, cause in reasons).most_common(1)[0][0]
     return next(reason for reason, other in reversed(reasons) if other is cause)
 
 
 def _interrupted(located: RunResult) -> list[str]:
-    """Name the longest stretches without a pose after the first fix, in the order of the run."""
+    """List the longest interruptions, in the order of the run."""
     gaps, begin = located.interruptions, located.fixes[0].stamp
     longest = sorted(gaps, key=lambda gap: -gap.frames)[:_TOLD]
     lines = [

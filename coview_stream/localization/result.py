@@ -36,8 +36,8 @@ class KeyframeEvidence:
         stamp: seconds.
         state: after the decision.
         reason: one clause for people.
-        score: evidence score of the best hypothesis, 0 if there is none.
-        rival: score by the field of the most probable place elsewhere, not registered; 0 if there is none.
+        score: evidence score of the best hypothesis, 0 without one.
+        rival: field score of the most probable other place, which is not registered; 0 without one.
         evidence: parts of the score, if a hypothesis could be registered.
         station: winning station of a search.
         shift: winning shift of the co-view descriptors; None if learned features named the place.
@@ -82,7 +82,7 @@ class KeyframeEvidence:
 
     @classmethod
     def from_json(cls, data: dict[str, Any]) -> KeyframeEvidence:
-        """Read back data of :meth:`to_json`, also with the fewer keys of earlier versions; KeyError or ValueError."""
+        """Read data of :meth:`to_json`, also of earlier versions with fewer keys; KeyError or ValueError."""
         has_shares = data.get(_SHARES[0]) is not None
         parts = Evidence(**{n: float(data[n]) for n in _SHARES}) if has_shares else None
         return cls(
@@ -104,7 +104,7 @@ class KeyframeEvidence:
 def calibration_says(
     calibration: Calibration, evidence: KeyframeEvidence | None, mount: Mount | None = None, one_scan: bool = False
 ) -> list[str]:
-    """Return the clauses of a calibration; none while clouds or odometry are at fault, which may have spoilt it."""
+    """Return the clauses of a calibration; none while clouds or odometry have a fault, which may have spoilt it."""
     return [] if evidence is not None and evidence.cause in FAULTS else calibration.describe(mount, one_scan)
 
 
@@ -114,20 +114,20 @@ def calibration_json(
     mount: Mount | None = None,
     one_scan: bool = False,
 ) -> dict[str, Any] | None:
-    """Plain data of a calibration, None for none; ``says`` are its clauses beside the newest ``evidence``."""
+    """Plain data of a calibration, None for None; ``says`` has its clauses, given the newest ``evidence``."""
     if calibration is None:
         return None
     return calibration.to_json() | {"says": calibration_says(calibration, evidence, mount, one_scan)}
 
 
 def _number(value: float | None, form: str) -> float | None:
-    """Round a number by its format; None for none, and for a number that JSON cannot hold."""
+    """Round a number by its format; None for None and for numbers that JSON cannot hold."""
     return None if value is None or not math.isfinite(value) else float(f"{value:{form}}")
 
 
 @dataclass(frozen=True, eq=False)
 class Fix:
-    """The localizer's answer to one frame. Two are equal only if they are the same object.
+    """The localizer's answer to one frame. Fixes compare by identity.
 
     Attributes:
         stamp: of the frame, seconds.
@@ -138,12 +138,12 @@ class Fix:
             rotations about the map's axes x, y and z (up), not the body's own roll and pitch. It is relative to the
             map, without the error of its georeferencing, and calibrated on simulated drives: see docs/tracking.md. One
             sigma of x, y and z, metres, is ``fix.stddev[:3]``.
-        confidence: probability in [0, 1] that the robot is at this place, by the search that found it or by the newest
-            registration, whichever is less: see docs/integrity.md. 0 unless TRACKING.
+        confidence: probability in [0, 1] that the robot is at this place, the lesser of those by the search that found
+            it and by the newest registration: see docs/integrity.md. 0 unless TRACKING.
         evidence: of the newest keyframe, None before the first.
-        drift: rates of odometry's drift, to go on from this pose with; None unless TRACKING.
-        protection: metres and degrees that the pose's error, relative to the map, exceeds at most once in a thousand:
-            see docs/tracking.md; None unless TRACKING.
+        drift: rates of odometry's drift, to propagate this pose; None unless TRACKING.
+        protection: metres and degrees that the pose's error, relative to the map, exceeds at most once in a thousand
+            poses: see docs/tracking.md; None unless TRACKING.
         calibration: corrections of the sensor's tilt and of odometry, in any state, from the second keyframe on.
     """
 
@@ -159,11 +159,11 @@ class Fix:
     calibration: Calibration | None = None
 
     def carried(self, stamp: float, T_odom_body: Pose, driven: float, turned: float) -> Fix:
-        """Return this fix, which has a pose, carried on to a later frame by odometry: less certain by its drift.
+        """Return this fix propagated to a later frame by odometry, with the covariance of its drift added.
 
         Args:
             stamp: of the later frame, seconds.
-            T_odom_body: (4, 4) odometry there, as it came.
+            T_odom_body: (4, 4) raw odometry there.
             driven: metres from this fix's frame to that one.
             turned: radians likewise.
 
@@ -192,18 +192,18 @@ class Fix:
 
     @property
     def quaternion(self) -> Floats | None:
-        """(4,) x, y, z, w of the rotation map <- body; None likewise."""
+        """(4,) x, y, z, w of the rotation map <- body; None unless TRACKING."""
         return None if self.T_map_body is None else quaternion_of(self.T_map_body)
 
     @property
     def stddev(self) -> Floats | None:
-        """(6,) one sigma of x, y, z, roll, pitch, yaw, metres and radians, of :attr:`covariance`; None likewise."""
+        """(6,) standard deviations of x, y, z, roll, pitch, yaw, metres and radians; None unless TRACKING."""
         return None if self.covariance is None else stddev_of(self.covariance)
 
     def to_json(self) -> dict[str, Any]:
         """Plain data with the names of pose messages: always the same keys, None for an unknown value.
 
-        ``state`` is one of the four that are reported; ``orientation`` is x, y, z, w; matrices are in rows.
+        ``state`` is one of the four reported states; ``orientation`` is x, y, z, w; matrices are row-major.
         """
         pose: dict[str, Any] = dict.fromkeys(("position", "orientation", "covariance"))
         if self.T_map_body is not None:

@@ -1,4 +1,4 @@
-"""State of a localizer in a file, for programs that start again on a robot that stands where it stood."""
+"""State of a localizer in a file, for programs that restart on a robot that has not moved."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from coview_stream.localization.calibration.calibration import Calibration
 from coview_stream.localization.result import Fix
 
 _FORMAT, _VERSION = "coview_stream state", 1
-_MAX_BYTES = 65_536  # ours have a thousand
+_MAX_BYTES = 65_536  # a saved state has a thousand
 
 
 class _Localizer(Protocol):
@@ -38,8 +38,8 @@ class SavedState:
     def save_state(self: _Localizer, path: str | os.PathLike[str]) -> None:
         """Write the pose of the newest frame and the calibration, as JSON, complete or not at all.
 
-        Without a pose, one that the file holds already stays; before the first frame, the whole file. Call it after
-        frames, as often as you like: a crash or a power cut then costs little. OSError if the file cannot be written.
+        Without a pose, the pose already in the file stays; before the first frame, the whole file. Call it after
+        frames, as often as you like, to lose little in a crash or power cut. OSError if the file cannot be written.
         """
         path = Path(path)
         try:
@@ -61,10 +61,10 @@ class SavedState:
             file.write(json.dumps(document, indent=1).encode())
 
     def load_state(self: _Localizer, path: str | os.PathLike[str]) -> bool:
-        """Begin with the file of :meth:`save_state`; call it before the first frame. False if there is no file.
+        """Start from the file of :meth:`save_state`, before the first frame. False if there is no file.
 
         The pose is a hint, which the search judges like any other place (:meth:`Localizer.hint_pose`): the robot may
-        have been carried. InputError if the file is damaged, of another version, or something else.
+        have been carried. InputError if the file is damaged, of another version, or of another kind.
         """
         path = Path(path)
         if not path.exists():
@@ -88,7 +88,7 @@ def _read(path: Path) -> tuple[Pose | None, Calibration | None]:
 
 
 def read_document(data: bytes, form: str, version: int) -> dict[str, Any]:
-    """Return a JSON document that names its format and version; ValueError or RecursionError if it is none of these."""
+    """Return a JSON document of a format and version; ValueError or RecursionError if it is damaged or differs."""
     document: Any = json.loads(data)
     if not isinstance(document, dict) or document.get("format") != form:
         raise ValueError("it is something else")
@@ -98,7 +98,7 @@ def read_document(data: bytes, form: str, version: int) -> dict[str, Any]:
 
 
 def read_pose(document: Any, name: str) -> Pose:
-    """Return a transform of plain data; ValueError, TypeError or KeyError if it is none."""
+    """Return a transform (4, 4) from plain data; ValueError, TypeError or KeyError if it is not one."""
     T = np.asarray(document[name], dtype=np.float64)
     if not is_pose(T):
         raise ValueError(f"{name} is not a finite rigid 4x4 transform")
@@ -106,7 +106,7 @@ def read_pose(document: Any, name: str) -> Pose:
 
 
 def read_calibration(plain: Any) -> Calibration | None:
-    """Return a calibration of plain data, None of None; ValueError, TypeError or InputError if it is none."""
+    """Return a calibration from plain data, None from None; ValueError, TypeError or InputError if it is not one."""
     if plain is None:
         return None
     if not isinstance(plain, dict):

@@ -1,4 +1,4 @@
-"""Search requests: keyframes, hints and the check of odometry, while no place is known."""
+"""Search requests: keyframes, hints and the odometry check, while no place is known."""
 
 from __future__ import annotations
 
@@ -19,25 +19,25 @@ from coview_stream.localization.tracking.monitor import RejectionReason
 
 
 class NoSearch(NamedTuple):
-    """Reason why a frame begins no search; ``cause`` is ODOMETRY if the frames contradict odometry."""
+    """Reason why a frame starts no search; ``cause`` is ODOMETRY if the frames contradict odometry."""
 
     reason: str
     cause: RejectionReason | None = None
 
 
 class SearchRequests:
-    """Maker of one robot's search requests.
+    """Source of one robot's search requests.
 
     Attributes:
-        epoch: of the next request; results of another epoch are out of date.
-        hints: poses that the search is to try.
+        epoch: of the next request; results of other epochs are out of date.
+        hints: poses for the search to try.
     """
 
     def __init__(
         self, base_map: BaseMap, config: LocalizerConfig, spec: RequestSpec, frames: FramePreparation, odometry: int,
         restarts: Iterator[int],
     ) -> None:  # fmt: skip
-        """Begin without a keyframe, in odometry frame number ``odometry``; ``restarts`` numbers the epochs."""
+        """Start without keyframes, in odometry frame number ``odometry``; ``restarts`` numbers the epochs."""
         self.epoch = Epoch(odometry, next(restarts))
         self._restarts = restarts
         self.hints = PoseHints()
@@ -74,7 +74,7 @@ class SearchRequests:
             self._buffer, keyframe, cloud=calibration.level(rays), spec=self._spec,
             travelled=travelled, epoch=self.epoch, hints=hints, guesses=guesses, area=area,
         )  # fmt: skip
-        # the search would thin it too: a tenth of the points remains, and requests travel through pipes
+        # the search would thin it too, but requests travel through pipes, and thinning leaves a tenth of the points
         config = self._config.registration
         earlier = (
             each._replace(submap=thinned(each.submap, each.T_odom_body[:3, 3], config)) for each in request.earlier
@@ -84,7 +84,7 @@ class SearchRequests:
         return replace(request, submap=submap, earlier=tuple(earlier), lean_prior=prior)
 
     def guess(self, guess: PlaceGuess) -> None:
-        """Try a guess of the place; a circle that comes, goes or changes begins an epoch."""
+        """Try a guess of the place; a circle that is added, removed or changed starts an epoch."""
         if guess.within is not None or self.hints.circle is not None:
             self.next_epoch()
         self.hints.guess(guess)
@@ -95,18 +95,18 @@ class SearchRequests:
         self._buffer.clear()
 
     def place_lost(self, T_map_odom: Pose) -> None:
-        """Start again, as odometry may have jumped; it may also go on from ``T_map_odom`` (4, 4): that is a hint."""
+        """Restart, as odometry may have jumped; that it continues from ``T_map_odom`` (4, 4) is a hint."""
         if self._frames.anchor is not None:
             self.hints.odometry_continues(T_map_odom, self._frames.anchor)
         self.begin_anew()
 
     def begin_anew(self) -> None:
-        """Forget the keyframes so far; the hints stay."""
+        """Forget the keyframes; the hints stay."""
         self._odometry_check.clear()
         self._restart()
 
     def next_epoch(self) -> None:
-        """Begin another epoch: results of earlier requests are out of date."""
+        """Start another epoch: results of earlier requests are out of date."""
         self.epoch = self.epoch._replace(restart=next(self._restarts))
 
     def _restart(self) -> None:

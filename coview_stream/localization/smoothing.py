@@ -1,14 +1,14 @@
-"""Smoothing, offline: the poses of a whole run at once, from the registrations before and after each frame.
+"""Offline smoothing: all poses of a run at once, from the registrations before and after each frame.
 
-The graph has a node per usable frame: the pose X_k of the body. With e(A, B) = log(A^-1 B) the poses are the most
-probable ones given
+The graph has a node per usable frame: the body's pose X_k. With e(A, B) = log(A^-1 B) the poses are the most probable
+given
 
 * odometry:       e(Z_k, X_(k-1)^-1 X_k) ~ N(0, Q_k), corrected by the calibration at the end of the run
-* registrations:  e(Y_k, X_k) ~ N(0, R_k), live ones and those of tracking backwards, under Huber's kernel
+* registrations:  e(Y_k, X_k) ~ N(0, R_k), live and backward, under Huber's kernel
 
 Where odometry is broken there is no factor, and nothing is smoothed across: tracking noticed a slip, or the
-registrations on both sides contradict odometry (a robot that was carried, odometry that jumped or began anew). Q has
-the drift that tracking measured, and the uncertainty of scale and heading rate over the way between two registrations.
+registrations on both sides contradict odometry (a carried robot, odometry that jumped or restarted). Q contains the
+measured drift, and the uncertainty of scale and heading rate over the path between two registrations.
 """
 
 from __future__ import annotations
@@ -46,27 +46,27 @@ from coview_stream.recordings.run import Run
 
 
 class PoseKind(StrEnum):
-    """Kind of a smoothed pose; frames of the first kind alone had a pose live."""
+    """Kind of a smoothed pose; only frames of kind SMOOTHED had a live pose."""
 
     SMOOTHED = "smoothed"
-    """The frame had a live pose; registrations around it have corrected it, or it is as it was where there is none."""
+    """The frame had a live pose, which the registrations around it correct; without any it is unchanged."""
     BACKWARD = "backward"
-    """Tracked backwards from a later fix: registered to the map and verified as live poses are."""
+    """Tracked backwards from a later fix: registered to the map and verified like live poses."""
     BRIDGED = "bridged"
     """By odometry alone, between registrations on both sides that agree with it."""
 
 
 @dataclass(frozen=True, eq=False)
 class SmoothedPose:
-    """Pose of one frame by the whole run; offline only, so it is no :class:`coview_stream.Fix`.
+    """Pose of one frame by the whole run; as it exists offline only, it is no :class:`coview_stream.Fix`.
 
     Attributes:
         stamp: of the frame, seconds.
-        kind: how the pose came about.
+        kind: origin of the pose.
         T_map_body: (4, 4) float64 in the frame of the map's sources.
-        covariance: (6, 6) over (x, y, z, roll, pitch, yaw), m2 and rad2, as of a Fix.
-        protection: metres and degrees that the error exceeds at most once in a thousand.
-        confidence: probability that the robot is at this place, by the fix that the pose goes back to.
+        covariance: (6, 6) over (x, y, z, roll, pitch, yaw), m2 and rad2, as in a Fix.
+        protection: metres and degrees that the error exceeds at most once in a thousand poses.
+        confidence: probability that the robot is at this place, by the fix from which the pose derives.
     """
 
     stamp: float
@@ -81,7 +81,7 @@ def smooth_run(localizer: RecordingLocalizer, run: Run, frames: Sequence[Recorde
     """Return the smoothed poses of a recorded run, in order; none without a live pose.
 
     Args:
-        localizer: that has localized the run; it is used again to track backwards.
+        localizer: which has localized the run; it is reused to track backwards.
         run: to read the frames without a live pose again.
         frames: all usable ones; registrations of the backward pass are added.
     """
@@ -106,25 +106,25 @@ def smooth_run(localizer: RecordingLocalizer, run: Run, frames: Sequence[Recorde
 
 @dataclass(eq=False)
 class _Chain:
-    """All frames of a run, in order (N), with the odometry between them and their registrations."""
+    """All frames of a run, in order (N), the odometry between them, and their registrations."""
 
     frames: Sequence[RecordedFrame]
     odometry: Poses  # (N, 4, 4) corrected
     registered: dict[int, BelievedRegistration]  # by frame, in order
-    keys: Ints  # (M,) frames of these
-    measured: dict[int, Pose]  # (4, 4) of their bodies
+    keys: Ints  # (M,) frames with a registration
+    measured: dict[int, Pose]  # (4, 4) body pose, by frame
     driven: Floats  # (N,) metres up to each frame
-    spread: Floats  # (N, 6, 6) of the motion from the frame before, over (rx, ry, rz, x, y, z), map axes
-    # (N, 4, 4) motion of the body from the cloud's moment, which may be late, to the stamp
+    spread: Floats  # (N, 6, 6) of the motion from the previous frame, over (rx, ry, rz, x, y, z), map axes
+    # (N, 4, 4) motion of the body from the moment of the cloud, which may be late, to the stamp
     since_cloud: Poses = field(kw_only=True)
-    rates: Floats = field(kw_only=True)  # (N, 3) velocities of the body, as of a Moment
+    rates: Floats = field(kw_only=True)  # (N, 3) rates of the body, as in a Moment
     calibration: Calibration = field(kw_only=True)
     broken: dict[int, tuple[int, int]] = field(default_factory=dict)
-    """Frames whose motion from the one before is unknown, and the registered frames before and after."""
+    """Frames whose motion from the previous frame is unknown, with the registered frames before and after."""
     unknown: set[int] = field(default_factory=set)
-    """Frames at a break that may lie on either side of it."""
+    """Frames at a break that may belong to either side."""
     refuted: set[int] = field(default_factory=set)
-    """Frames whose live pose the scan speaks against."""
+    """Frames whose scan contradicts the live pose."""
 
     @classmethod
     def of(
@@ -165,11 +165,11 @@ class _Chain:
         return chain
 
     def _predicted(self, known: int, k: int) -> Pose:
-        """Return the pose (4, 4) of frame ``k`` by odometry from a registered one."""
+        """Return frame ``k``'s pose (4, 4) by odometry from a registered frame."""
         return np.asarray(self.measured[known] @ inverse(self.odometry[known]) @ self.odometry[k])
 
     def _spread_calibration(self, calibration: Calibration) -> None:
-        """Add the calibration's error over the way between two registrations, in shares of the metres."""
+        """Add the calibration's error over the path between two registrations, distributed by the metres driven."""
         ends = sorted({0, *self.registered, len(self.frames) - 1})
         for before, after in pairwise(ends):
             metres = self.driven[after] - self.driven[before]
@@ -180,9 +180,9 @@ class _Chain:
                 self.spread[before + 1 : after + 1] += shares[:, None, None] * calibration.motion_covariance(way)
 
     def _break(self, registered: Sequence[int], max_innovation: float) -> None:
-        """Find the breaks up to a live registration, the last of ``registered``; those before it are backward ones.
+        """Find the breaks up to the last of ``registered``, a live registration.
 
-        The first one is the live registration before, if there is one.
+        The first one is the previous live registration, if any; those between are backward registrations.
         """
         slipped_back = [self.registered[k].backward and self.registered[k].slipped for k in registered]
         slipped = self.registered[registered[-1]].slipped and not any(slipped_back)
@@ -207,10 +207,10 @@ class _Chain:
         return float(gap @ np.linalg.solve(spread, gap))
 
     def settle_breaks(self, fit: Callable[[int, Pose], float]) -> None:
-        """Compare the last live poses before each break with the poses that the registration after it leads to.
+        """Compare the last live poses before each break with the poses predicted from the registration after it.
 
-        Where these fit the map better the break moves before the frame; a frame that is not beside it gets no pose, nor
-        does one that fits at neither. ``fit`` returns how well a frame fits at a pose (4, 4).
+        Where the latter fit the map better, the break moves to before the frame. A frame that is not next to the break,
+        or that fits at neither pose, gets none. ``fit`` returns how well a frame fits at a pose (4, 4).
         """
         for at, (before, after) in list(self.broken.items()):
             first = at
@@ -253,9 +253,9 @@ class _Chain:
 
     @cached_property
     def _beside_breaks(self) -> set[int]:
-        """Frames between the live registrations on both sides of a break: what odometry did there is not known.
+        """Frames between the live registrations on both sides of a break, where odometry's motion is unknown.
 
-        Their live poses stay as they are: a backward registration beside a break is not worth more.
+        They keep their live poses: a backward registration next to a break is no better.
         """
         live, out = [k for k in self.keys.tolist() if not self.registered[k].backward], set[int]()
         for before, after in self.broken.values():
@@ -264,7 +264,7 @@ class _Chain:
         return out
 
     def _nodes(self) -> tuple[list[int], Poses]:
-        """Return the frames (M) that the graph poses, and poses (M, 4, 4) by odometry from a registration near them."""
+        """Return the frames (M) in the graph, and start poses (M, 4, 4) by odometry from a registration nearby."""
         parts: list[list[int]] = []
         for k in range(len(self.frames)):
             if self._kind(k) is not None:
@@ -274,7 +274,7 @@ class _Chain:
         nodes, poses = [], []
         for part in parts:
             keys = [k for k in part if k in self.registered]
-            # a single registration without a live pose that contradicts odometry on both sides is no evidence
+            # without a live pose, a single registration that contradicts odometry on both sides is no evidence
             if len(keys) > 1 or (keys and any(self._kind(k) is PoseKind.SMOOTHED for k in part)):
                 nodes += part
                 near = np.clip(np.searchsorted(keys, part, "right") - 1, 0, None)
@@ -292,7 +292,7 @@ class _Chain:
         return PoseKind.BRIDGED if self.keys[0] < k < self.keys[-1] else None
 
     def _pose(self, k: int, T: Pose, covariance: Floats, origin: Floats) -> SmoothedPose:
-        """Return the pose of a frame that has one; the error that registrations share is that of the nearest one."""
+        """Return a frame's pose; the error shared by registrations is taken from the nearest one."""
         frame, kind = self.frames[k], self._kind(k)
         assert kind is not None
         at = int(np.searchsorted(self.keys, k))
@@ -320,4 +320,4 @@ def _as_live(frame: RecordedFrame) -> SmoothedPose:
 
 
 def _within_alert_limit(level: ProtectionLevel) -> bool:
-    return level.horizontal <= ALERT_METRES and level.degrees <= ALERT_DEGREES  # a height may be unknown by metres
+    return level.horizontal <= ALERT_METRES and level.degrees <= ALERT_DEGREES  # the height may be unknown by metres

@@ -1,4 +1,4 @@
-"""The states of a robot, the events that change them, and the one table that says how (docs/tracking.md prints it)."""
+"""States of a robot, the events that change them, and their transitions (docs/tracking.md prints the table)."""
 
 from __future__ import annotations
 
@@ -6,22 +6,22 @@ from enum import StrEnum
 
 
 class State(StrEnum):
-    """State of a robot's localization: how much is known of its place."""
+    """State of localization: how much is known of the robot's place."""
 
     SEARCHING = "SEARCHING"
     """No place explains the scans well enough, or there are too few points."""
     AMBIGUOUS = "AMBIGUOUS"
-    """A place does, but another one does too, or the evidence does not suffice yet."""
+    """One place fits, but so does another, or the evidence does not suffice yet."""
     TRACKING = "TRACKING"
     """The pose is known: the newest registration speaks for it."""
     DOUBTED = "DOUBTED"
-    """A place is known, but it has to be verified before there is a pose again."""
+    """A place is known, but has to be verified before there is a pose again."""
     LOST = "LOST"
-    """A place was known; the evidence has gone and the whole map is searched again, or odometry or frames stay away."""
+    """A place was known, but its evidence has gone: the whole map is searched; or odometry or frames are missing."""
 
     @property
     def reported(self) -> str:
-        """Name in messages and files, which know four states: DOUBTED is reported as AMBIGUOUS, with its cause."""
+        """Name in messages and files, which have four states: DOUBTED is reported as AMBIGUOUS, with its cause."""
         return State.AMBIGUOUS.value if self is State.DOUBTED else self.value
 
     @property
@@ -58,10 +58,10 @@ TRANSITIONS: dict[tuple[State, Event], State] = {
     (_S.DOUBTED, _E.PLACE_GIVEN_UP): _S.LOST,
     (_S.LOST, _E.PLACE_ACCEPTED): _S.TRACKING,
 }
-"""State of the engine that follows on an event; where a pair is missing, the event changes nothing.
+"""State that follows on an event; an event without an entry changes nothing.
 
-LOST stays LOST while the map is searched again: only an accepted place ends it. A node loses a place for more reasons,
-by :class:`coview_stream.stream.node.robot_state.RobotState`.
+LOST stays LOST while the map is searched: only an accepted place ends it. A node loses a place for further reasons:
+:class:`coview_stream.stream.node.robot_state.RobotState`.
 """
 
 

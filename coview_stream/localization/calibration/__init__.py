@@ -1,1 +1,1 @@
-"""Calibration: errors of a robot's sensor and odometry, estimated as it drives, and corrected."""
+"""Calibration: errors of a robot's sensor and odometry, estimated during the drive and corrected."""

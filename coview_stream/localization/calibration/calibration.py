@@ -1,4 +1,4 @@
-"""Calibration of sensor and odometry, and raw scans that are levelled by it when they are read."""
+"""Calibration of sensor and odometry, and raw scans, which are levelled by it on access."""
 
 from __future__ import annotations
 
@@ -28,26 +28,26 @@ from coview_stream.localization.calibration.odometry_history import Moment
 from coview_stream.odometry.deskew import SweepCorrection
 
 _LEAN, _SCALE, _TURN, _GROUND = math.radians(0.5), 0.01, math.radians(0.05), 0.1
-"""Least corrections that are reported: radians, factor, radians per metre, metres."""
+"""Smallest corrections that are reported: radians, factor, radians per metre, metres."""
 _TURNED, _SHIFTED, _LATE = math.radians(1.0), 0.1, 0.02
 """Likewise: radians of heading, metres of lever arm, seconds."""
-_RARE_SIGMAS = 3.29  # that a Gaussian exceeds once in a thousand, either way
-_TOLD = 2.0  # sigmas, below which such a correction is not reported
+_RARE_SIGMAS = 3.29  # exceeded by a Gaussian once in a thousand, either way
+_TOLD = 2.0  # sigmas; a less certain correction is not reported
 _MOVED = {
     "sigma_tilt": math.radians(1.0), "sigma_scale": 0.02, "sigma_turn": math.radians(0.02),
     "sigma_heading": math.radians(0.3), "sigma_lever": 0.02, "sigma_delay": 0.005,
 }  # fmt: skip
-"""Least sigmas of a calibration from before the node started."""
+"""Lower limits of the sigmas of a calibration from before the node started."""
 _ONE_SCAN = "is it the vehicle or the sensor? set --mount only if the lean stays in a run with odometry"
 HEADING_TOLERANCE, LEVER_TOLERANCE, CLOCK_TOLERANCE = math.radians(0.1), 0.005, 0.001
-"""Sigmas of a mount as drawn and of clocks as set by PTP or an edge: radians, metres, seconds."""
+"""Sigmas of a mount taken from drawings and of clocks set by PTP or an edge: radians, metres, seconds."""
 _RANGES = {
     **dict.fromkeys(("roll", "pitch"), math.radians(45.0)), "heading": math.pi,
     "sigma_tilt": 1.0, "sigma_heading": 1.0, "scale": 3.0, "sigma_scale": 1.0, "turn": 0.5, "sigma_turn": 1.0,
     **dict.fromkeys(("lever_x", "lever_y", "sigma_lever", "sigma_height", "ground", "changed"), MAX_LEVER),
     **dict.fromkeys(("delay", "stated_delay", "sigma_delay"), 2.0 * MAX_DELAY),
 }  # fmt: skip
-"""Largest values of a robot, in the units of :class:`Calibration`; sigmas are not negative."""
+"""Largest plausible values, in the units of :class:`Calibration`; sigmas are not negative."""
 _ACCELERATION, _TURN_ACCELERATION = 0.5, 0.2  # m/s2 and rad/s2 of wheeled robots, one sigma
 
 
@@ -58,20 +58,20 @@ class Calibration:
     Attributes:
         roll: radians about the body's x that level clouds in odometry's gravity.
         pitch: radians about the body's y, likewise.
-        scale: factor that corrects odometry's distances, less one.
+        scale: correction factor of odometry's distances, less one.
         turn: correction of odometry's heading, radians per metre driven.
         sigma_tilt: one sigma of roll and of pitch, radians.
         sigma_scale: one sigma of the scale.
         sigma_turn: one sigma of the turn, radians per metre.
         ground: height of the site's present ground above the survey's, metres.
-        heading: radians about the body's z that turn clouds into the body's axes, before roll and pitch.
-        lever_x: metres forward of the body's origin to the point that clouds take for it.
-        lever_y: metres to its left, likewise.
-        delay: seconds that clouds are stamped later than odometry; negative where odometry is late.
+        heading: radians about the body's z that rotate clouds into the body's axes, before roll and pitch.
+        lever_x: metres forward from the body's origin to the origin of the clouds.
+        lever_y: metres to the left, likewise.
+        delay: seconds by which clouds are stamped later than odometry; negative where odometry is late.
         sigma_heading: one sigma of the heading, radians.
         sigma_lever: one sigma of each of lever_x and lever_y, metres.
         sigma_delay: one sigma of the delay, seconds.
-        changed: metres of the ground around above the survey's, where it was dug or filled since; 0 where it was not.
+        changed: height of the surrounding ground above the survey's, metres, if dug or filled since; 0 if not.
         stated_delay: the part of ``delay`` that ``LocalizerConfig.cloud_delay`` states.
         sigma_height: one sigma of the lever arm's height, metres, which motion does not show.
     """
@@ -96,23 +96,23 @@ class Calibration:
     sigma_height: float = 0.0
 
     def require_plausible(self) -> Calibration:
-        """Return it; InputError if a value is not finite or none of a robot."""
+        """Return it; InputError if a value is not finite or not plausible for a robot."""
         for name, largest in _RANGES.items():
             value = getattr(self, name)
             least = 0.0 if name.startswith("sigma") else -largest
-            if not least <= value <= largest:  # NaN is outside, too
+            if not least <= value <= largest:  # rejects NaN, too
                 allowed = f"{least:.4g} to {largest:.4g} (radians, metres, seconds)"
                 raise InputError(f"calibration: {name} is {value!r}, which is none of a robot; give {allowed}")
         return self
 
     @cached_property
     def R_tilt(self) -> Floats:
-        """(3, 3) rotation that levels clouds in the body's heading."""
+        """(3, 3) rotation that levels clouds, in the body's heading."""
         return exp_so3(np.array([self.roll, self.pitch, 0.0]))
 
     @cached_property
     def R_body_cloud(self) -> Floats:
-        """(3, 3) rotation that turns clouds into the body's axes."""
+        """(3, 3) rotation of clouds into the body's axes."""
         return self.R_tilt @ rot_z(self.heading) if self.heading else self.R_tilt
 
     @cached_property
@@ -126,11 +126,11 @@ class Calibration:
         return SweepCorrection(self.R_body_cloud, self.scale)
 
     def leans_from(self, other: Calibration) -> float:
-        """Return the angle between the levels of two calibrations, radians."""
+        """Return the angle in radians between the levels of two calibrations."""
         return rotation_angle(self.R_body_cloud.T @ other.R_body_cloud)
 
     def level(self, cloud: Points) -> Points:
-        """Return a cloud (N, 3) in the body's axes, from the sensor's."""
+        """Return a cloud (N, 3) in the body's axes, given in the sensor's."""
         T = self.T_body_cloud
         return cloud if np.array_equal(T, np.eye(4)) else transform(T, cloud)
 
@@ -140,7 +140,7 @@ class Calibration:
         Args:
             step: (3,) metres.
             turned: radians about z.
-            change: (3,) of the body's velocities (x, y, rotation about z) over the motion, the step's axes.
+            change: (3,) of the body's velocities (x, y, rotation about z) over the motion, in the step's axes.
         """
         along = np.concatenate([np.zeros(3), step])
         across = np.concatenate([np.zeros(3), [-step[1], step[0], 0.0]])
@@ -153,13 +153,11 @@ class Calibration:
         return np.asarray(spread)
 
     def pose_covariance(self, R_map_body: Floats, rates: Floats) -> Floats:
-        """Covariance (6, 6) over (rx, ry, rz, x, y, z), map axes, that mount and clock add to a pose of the body.
+        """Covariance (6, 6) over (rx, ry, rz, x, y, z), map axes, that mount and clock add to a body pose.
 
-        ``R_map_body`` (3, 3); ``rates`` (3,) velocities x, y and rotation about z of the body, its axes. A cloud that
-        is late leaves the robot behind.
-
-        The body is where the stated mount has it, and the stamp is the cloud's: only what is uncertain beyond the
-        tolerances of a correct robot counts.
+        ``R_map_body`` is (3, 3), ``rates`` (3,) the body's velocities x, y and rotation about z in its axes. A late
+        cloud leaves the robot behind. The stated mount defines the body, and the cloud's stamp the time: so only
+        uncertainty beyond the tolerances of a correct robot counts.
         """
         heading = max(0.0, self.sigma_heading**2 - HEADING_TOLERANCE**2)
         lever = max(0.0, self.sigma_lever**2 - LEVER_TOLERANCE**2)
@@ -169,13 +167,13 @@ class Calibration:
         return np.asarray(spread + np.outer(moving, moving) * late * max(0.0, self.sigma_delay**2 - CLOCK_TOLERANCE**2))
 
     def heights(self, others: OtherHeights) -> OtherHeights:
-        """Return heights that are possible beside a pose's, with those of the lever arm's, whose bound is known."""
+        """Return a pose's other possible heights, widened by the uncertain height of the lever arm."""
         reach = _RARE_SIGMAS * self.sigma_height
         return OtherHeights(others.variance + self.sigma_height**2, others.reach + reach)
 
     @property
     def extrapolation(self) -> Floats:
-        """(6, 6) covariance over (rx, ry, rz, x, y, z) of late odometry, which does not show accelerations yet."""
+        """(6, 6) covariance over (rx, ry, rz, x, y, z) of extrapolating late odometry, which lacks recent accelerations."""
         grown = 0.5 * min(self.delay, 0.0) ** 2
         moved = (grown * _ACCELERATION) ** 2
         return np.diag([0.0, 0.0, (grown * _TURN_ACCELERATION) ** 2, moved, moved, 0.0])
@@ -183,16 +181,16 @@ class Calibration:
     def describe(self, mount: Mount | None = None, one_scan: bool = False) -> list[str]:
         """Return one clause of text per noticeable correction.
 
-        Signs are as in ``--mount``; ``mount`` is already applied to the clouds. Of ``one_scan`` no motion was seen.
+        Signs are as in ``--mount``; ``mount`` is already applied to the clouds. ``one_scan`` has no motion.
         """
         clauses: list[str] = []
         given = mount or Mount()
         beyond = "" if given == Mount() else " beyond its mount"
-        # a remedy without the parts that may be nothing
+        # the remedy leaves out components that may be zero
         sits = math.hypot(self.lever_x, self.lever_y) >= max(_SHIFTED, _TOLD * self.sigma_lever)
         mended = self if sits else replace(self, lever_x=0.0, lever_y=0.0)
         option = given.moved(mended.T_body_cloud).option
-        if not given.drawn:  # its height is not seen
+        if not given.drawn:  # its height is not observable
             option = f"{option.rpartition(',')[0]},Z" if sits else f"{option},X,Y,Z"
         remedy = f"set --mount={option} to silence this" + ", metres by the drawing" * (not given.drawn)
         leans = [
@@ -236,7 +234,7 @@ class Calibration:
         return clauses
 
     def doubted(self) -> Calibration:
-        """Return the calibration with wider sigmas: the sensor may have been moved since."""
+        """Return the calibration with wider sigmas, as the sensor may have been moved since."""
         return replace(self, **{name: max(getattr(self, name), least) for name, least in _MOVED.items()})
 
     def to_json(self) -> dict[str, Any]:
@@ -263,13 +261,13 @@ class Calibration:
 
 
 LEVEL = math.radians(0.5)
-"""Radians by which a scan may lean and still be read as level: 0.15 m, the tolerance of ground, at 17 m."""
+"""Lean in radians up to which a scan counts as level: 0.15 m, the tolerance of ground, at 17 m."""
 
 
 def lean_prior(lean: float, sigma: float) -> float:
-    """Return the log-probability of a lean that was chosen to fit, of a sensor that leans by ``sigma`` on each axis.
+    """Return the log-probability of a lean that was fitted, for a sensor with ``sigma`` radians of lean per axis.
 
-    It is that of all leans within :data:`LEVEL`, as scans do not tell them apart. A smaller lean is none, and costs
+    It covers all leans within :data:`LEVEL`, as scans do not tell them apart. A smaller lean counts as none and costs
     nothing.
     """
     if lean < LEVEL:
@@ -279,20 +277,18 @@ def lean_prior(lean: float, sigma: float) -> float:
 
 
 class RawScan:
-    """Points of a frame in the sensor's axes, with the frame's odometry; levelled when they are read.
-
-    The newest reading is cached.
+    """Points of a frame in the sensor's axes, with its odometry; levelled on access, the newest result cached.
 
     Attributes:
         T_odom_body: (4, 4) odometry of the frame.
-        calibration: the calibration of the frame's time.
-        moment: of the frame; None where it is not known.
+        calibration: calibration at the time of the frame.
+        moment: of the frame; None if unknown.
     """
 
     def __init__(
         self, points: Points, T_odom_body: Pose, calibration: Calibration | None = None, moment: Moment | None = None
     ) -> None:
-        """Hold points (N, 3) float32, one per voxel, odometry frame, levelled by ``calibration`` (default: none)."""
+        """Store points (N, 3) float32, one per voxel, odometry frame, levelled by ``calibration`` (default: none)."""
         self.T_odom_body = T_odom_body
         self.calibration = calibration or Calibration()
         self.moment = moment

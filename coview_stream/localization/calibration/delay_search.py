@@ -1,4 +1,4 @@
-"""Search for the delay between clouds and odometry, by the motions between registrations."""
+"""Search for the delay between clouds and odometry, from the motions between registrations."""
 
 from __future__ import annotations
 
@@ -13,25 +13,24 @@ from coview_stream.geometry.transforms import Pose, inverse
 from coview_stream.localization.calibration.calibration import Calibration
 from coview_stream.localization.calibration.odometry_history import OdometryHistory
 
-RESOLUTION = 0.05  # seconds, within which the filter finds a delay
+RESOLUTION = 0.05  # seconds within which the filter converges to a delay
 DELAYS: Floats = RESOLUTION * np.arange(-20.0, 21.0)
 """Delays that are compared, seconds."""
 _FADES = 100.0  # metres over which evidence for a delay is forgotten, as clocks drift
 _FREEDOM = 4.0  # degrees of freedom of Student's distribution
-_STEPS = math.log(1e-6)  # of the probability that a clock has just taken a step: once in twelve days
+_STEPS = math.log(1e-6)  # log-probability that a clock has just taken a step: once in twelve days
 _TILT = 2.0  # ratio of a registration's errors of roll and pitch to that of its heading
 
 
 class SeenMotion(NamedTuple):
     """Registered motion between two clouds.
 
-    Attributes:
-        motion: (4, 4) in the body's axes.
-        begin: stamp of the first cloud, seconds.
-        end: of the second.
-        applied: calibration of that time.
-        noise: (3, 3) covariance of x, y and heading without the calibration's.
-        J: (3, 6) derivatives of x, y and heading by the calibration (eq. C2).
+    motion: (4, 4) in the body's axes.
+    begin: stamp of the first cloud, seconds.
+    end: stamp of the second cloud.
+    applied: calibration at that time.
+    noise: (3, 3) covariance of x, y and heading without the calibration's.
+    J: (3, 6) derivatives of x, y and heading by the calibration (eq. C2).
     """
 
     motion: Pose
@@ -43,7 +42,7 @@ class SeenMotion(NamedTuple):
 
     @property
     def spread(self) -> Floats:
-        """(3, 3) covariance with the calibration's, but for the delay."""
+        """(3, 3) covariance including the calibration's, except for the delay's."""
         known = self.applied
         sigmas = [known.sigma_scale, known.sigma_turn, 0.0, known.sigma_heading, known.sigma_lever, known.sigma_lever]
         others = self.J * np.array(sigmas)
@@ -51,15 +50,15 @@ class SeenMotion(NamedTuple):
 
 
 class DelaySearch:
-    """Search for the delay of the clouds on a grid.
+    """Grid search for the delay of the clouds.
 
-    The filter follows a delay that it nearly knows; here each delay is held against odometry itself at that time, so
-    that a large one is found, and the shaking of the body tells it, too. A motion is judged once odometry has gone on
-    by the largest delay.
+    The filter only follows a delay that it nearly knows. Here a motion is compared with odometry at each delay, which
+    finds large delays and also uses the shaking of the body. A motion is judged once odometry extends beyond it by the
+    largest delay.
 
     Attributes:
         evidence: (D,) log-likelihoods of DELAYS, up to a constant.
-        shaking: (D,) the part of it that roll and pitch of the body tell.
+        shaking: (D,) the part of it from the body's roll and pitch.
     """
 
     def __init__(self) -> None:
@@ -71,19 +70,19 @@ class DelaySearch:
         self._waiting.append(seen)
 
     def forget_motions(self) -> None:
-        """Forget the motions that wait: they are of another mount."""
+        """Forget the waiting motions, which belong to another mount."""
         self._waiting.clear()
 
     def judge(self, odometry: OdometryHistory) -> list[tuple[SeenMotion, Pose, Floats]]:
         """Judge the motions that odometry covers by now.
 
         Returns:
-            The motions, odometry's (4, 4) at the applied delay, and its velocities (2, 3) at both ends.
+            The motions, odometry's motion (4, 4) at the applied delay, and its velocities (2, 3) at both ends.
         """
         judged: list[tuple[SeenMotion, Pose, Floats]] = []
         while self._waiting and odometry.reaches(self._waiting[0].end + DELAYS[-1]):
             seen = self._waiting.popleft()
-            if odometry.covers(seen.begin - DELAYS[-1], seen.end):  # not after a stop that is longer than the history
+            if odometry.covers(seen.begin - DELAYS[-1], seen.end):  # false after a stop longer than the history
                 self._judge(seen, odometry)
                 begin, end = seen.begin - seen.applied.delay, seen.end - seen.applied.delay
                 step = inverse(odometry.at(begin)) @ odometry.at(end)
@@ -91,12 +90,12 @@ class DelaySearch:
         return judged
 
     def _judge(self, seen: SeenMotion, odometry: OdometryHistory) -> None:
-        """Hold a motion against odometry at each delay."""
+        """Compare a motion with odometry at each delay."""
         before, after = odometry.all_at(seen.begin - DELAYS), odometry.all_at(seen.end - DELAYS)
         R = before[:, :3, :3].transpose(0, 2, 1)
         moved = (1.0 + seen.applied.scale) * np.einsum("dij,dj->di", R, after[:, :3, 3] - before[:, :3, 3])
         turned = seen.motion[:3, :3] @ (R @ after[:, :3, :3]).transpose(0, 2, 1)
-        twice = turned.transpose(0, 2, 1) - turned  # the rotation, for small ones
+        twice = turned.transpose(0, 2, 1) - turned  # twice the rotation, for small angles
         tilts, heading = 0.5 * np.stack([twice[:, 1, 2], twice[:, 2, 0]], axis=1), 0.5 * twice[:, 0, 1]
         spread = seen.spread
         flat = np.column_stack([seen.motion[:2, 3] - moved[:, :2], heading])
@@ -111,9 +110,9 @@ class DelaySearch:
         self.shaking = np.maximum(shaking - shaking.max(), _STEPS)
 
     def better_than(self, delay: float, sigma: float, surprise: float) -> float | None:
-        """Return the delay with the most evidence, if it is beyond the applied ``delay`` with its ``sigma``, seconds.
+        """Return the most probable delay, seconds, if it lies beyond the applied ``delay`` with its ``sigma``.
 
-        None if it is not, or not by the log-odds of a ``surprise`` that may be at any place of the grid.
+        None if it does not, or if it lacks the log-odds of a ``surprise`` that may be anywhere on the grid.
         """
         near = np.abs(DELAYS - delay) <= 3.0 * sigma + RESOLUTION
         best, there = int(self.evidence.argmax()), self.evidence[near].max(initial=-math.inf)

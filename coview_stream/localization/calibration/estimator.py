@@ -2,19 +2,19 @@
 
 The state is x = (roll, pitch, s, w, g, τ, ψ, l): tilt of the sensor against odometry's gravity, scale of odometry's
 distances less one, turn of its heading per metre, lean of the odometry frame against the map (2 components), seconds
-that clouds are stamped later than odometry, heading of the sensor on the body and its lever arm (2 components). These
-are the systematic errors; :class:`coview_stream.localization.tracking.motion.Drift` holds the random ones. Every
+by which clouds are stamped later than odometry, heading of the sensor on the body and its lever arm (2 components).
+These are the systematic errors; :class:`coview_stream.localization.tracking.motion.Drift` has the random ones. Every
 believed registration to the map gives two measurements:
 
 * Attitude against odometry's gravity. With u the vertical in the body's axes, by the map and by odometry, the residual
   tilt is u_map x u_odometry (eq. C1). The sensor's tilt turns with the body, the lean of the odometry frame does not;
   the pose graph follows the latter.
-* Motion since the previous registration against odometry's (eq. C2, :func:`motion_jacobian`), apart from both
-  registrations' errors and odometry's random walk.
+* Motion since the previous registration against odometry's (eq. C2, :func:`motion_jacobian`), except for the errors of
+  both registrations and odometry's random walk.
 
 A motion far outside this model (slipping wheels) counts less, by Student's t distribution. All components walk randomly
 with the metres driven. While a place only leads a search, the state is a mixture of two Gaussians: the place is right
-and its attitude has been measured, or the place is wrong.
+and its attitude was measured, or the place is wrong.
 """
 
 from __future__ import annotations
@@ -40,7 +40,7 @@ from coview_stream.localization.calibration.delay_search import DELAYS, RESOLUTI
 from coview_stream.localization.calibration.odometry_history import Moment, OdometryHistory
 
 Moments = tuple[Moment | None, Moment | None]
-"""Moments of two clouds."""
+"""Moments of the two clouds of a motion."""
 
 
 class _Prior(NamedTuple):
@@ -61,9 +61,9 @@ _TILT = _Prior(
 _SCALE = _Prior(slice(2, 3), 0.003, 0.04, 0.3, 5e-4, ("scale",), "sigma_scale")
 _TURN = _Prior(slice(3, 4), math.radians(0.005), math.radians(0.05), 0.3, math.radians(5e-4), ("turn",), "sigma_turn")
 GRAVITY = _Prior(slice(4, 6), math.radians(0.25), math.radians(0.25), 1.0, math.radians(0.1))
-# Clocks and mounts are stated by who built the robot: a wrong one is a fault, rarer than the levels' risk or so.
-# Clocks that are set by PTP or by an edge agree within a millisecond, drawings within 0.1 degrees and half a
-# centimetre; a queue is late by up to a second, a sensor sits within a metre or two
+# Whoever built the robot states its clocks and mounts: a wrong one is a fault, about as rare as the levels' risk.
+# Clocks set by PTP or by an edge agree within a millisecond, drawings within 0.1 degrees and half a centimetre; a queue
+# is late by up to a second, and a sensor sits within a metre or two
 _CLOCK = _Prior(slice(6, 7), CLOCK_TOLERANCE, 0.5, 0.001, 3e-4, ("delay",), "sigma_delay")
 _HEADING = _Prior(
     slice(7, 8), HEADING_TOLERANCE, math.radians(10.0), 0.001, math.radians(0.01), ("heading",), "sigma_heading"
@@ -72,18 +72,18 @@ _LEVER = _Prior(slice(8, 10), LEVER_TOLERANCE, 0.7, 0.0005, 5e-4, ("lever_x", "l
 _GROUPS = (_TILT, _SCALE, _TURN, _CLOCK, _HEADING, _LEVER)  # corrected components
 _MOUNT = (_TILT, _HEADING, _LEVER)
 _RARE = (_CLOCK, _HEADING, _LEVER)
-_OF_SENSOR = (*_MOUNT, _CLOCK)  # none, where odometry is made of the sensor's own clouds
+_OF_SENSOR = (*_MOUNT, _CLOCK)  # fixed where odometry is computed from the sensor's own clouds
 SIZE = 10
 """Components of the state."""
 _WIDE = np.zeros(SIZE)
 for _group in (*_GROUPS, GRAVITY):
     _WIDE[_group.axes] = _group.wide
-_MOTION = np.array([2, 3, 6, 7, 8, 9])  # components that show in a motion
+_MOTION = np.array([2, 3, 6, 7, 8, 9])  # components that affect a motion
 _FAULTY = {count: np.array(list(itertools.product([False, True], repeat=count))) for count in (1, 5)}
 """Choices (M, groups) of faulty groups."""
-_FREE = 1e6  # variance, in units of the wide prior's, that does not hold a component
-_GUESSED = 0.9  # probability that a mount of which only angles are stated is off by more than a drawing's tolerance
-_STEPPED = 0.5  # probability of a fault where something speaks for a step
+_FREE = 1e6  # variance, in units of the wide prior's, of a component that is left free
+_GUESSED = 0.9  # probability that a mount with only its angles stated is off by more than a drawing's tolerance
+_STEPPED = 0.5  # probability of a fault where there is evidence of a step
 _FREEDOM = 4.0  # degrees of freedom of Student's distribution
 
 
@@ -98,7 +98,7 @@ def motion_jacobian(step: Pose, rates: Floats, scale: float = 0.0) -> Floats:
     Args:
         step: (4, 4) odometry's motion, in the body's axes at its start.
         rates: (2, 3) velocities x, y and rotation about z at start and end, in the body's axes there.
-        scale: by which the step is corrected.
+        scale: correction already applied to the step.
     """
     t, R = step[:2, 3], step[:2, :2]
     across = np.array([-t[1], t[0]])
@@ -116,9 +116,9 @@ def motion_jacobian(step: Pose, rates: Floats, scale: float = 0.0) -> Floats:
 class CalibrationBelief:
     """Gaussian over the state x = (roll, pitch, s, w, g, τ, ψ, l), with heavier tails where measurements contradict it.
 
-    Most sensors stand straight and most odometry has the right scale. So a group is a mixture of a narrow prior about
-    zero, or an earlier value, and a wide one; the applied value is the mean of both by their probabilities
-    (Savage-Dickey ratio, eq. C3).
+    Most sensors are mounted straight and most odometry has the right scale. So the prior of a group is a mixture of a
+    narrow one about zero, or an earlier value, and a wide one; the applied value is the mean of both by their
+    probabilities (Savage-Dickey ratio, eq. C3).
 
     Attributes:
         x: (10,) mean.
@@ -146,10 +146,10 @@ class CalibrationBelief:
         present = self.applied()
         for group in _GROUPS:
             if group is _CLOCK and earlier.stated_delay != self._stated_delay:
-                continue  # it has been stated since
+                continue  # the stated delay has changed since
             sigma, axes = getattr(earlier, group.sigma), np.arange(SIZE)[group.axes]
             values = [getattr(earlier, name) for name in group.names]
-            if group in _RARE and sigma**2 < self.P[axes, axes].mean():  # as it was, rather than as it should be
+            if group in _RARE and sigma**2 < self.P[axes, axes].mean():  # centred at the earlier value
                 self.x[group.axes] = self._centre[group.axes] = values
                 self._exact[group.sigma] = max(sigma, group.exact)
                 if same_run:
@@ -169,7 +169,7 @@ class CalibrationBelief:
         self.P[_SCALE.axes, _SCALE.axes] = (sigma * scale) ** 2
 
     def widen(self, groups: tuple[_Prior, ...]) -> None:
-        """Suppose that components have taken a step from their present values, or not."""
+        """Widen the groups, as their components may have taken a step from their present values."""
         present = self.applied()
         for group in groups:
             self._centre[group.axes] = [getattr(present, name) for name in group.names]
@@ -192,7 +192,7 @@ class CalibrationBelief:
         self._stand_straight()
 
     def begin_at(self, delay: float, sigma: float) -> None:
-        """Begin anew at a delay; scale and turn, which may have stood in for it, are forgotten."""
+        """Restart at a delay; reset scale and turn, which may have absorbed it."""
         for group, mean, spread in ((_CLOCK, delay, sigma), (_SCALE, 0.0, _SCALE.wide), (_TURN, 0.0, _TURN.wide)):
             self.x[group.axes] = mean
             self.P[group.axes], self.P[:, group.axes] = 0.0, 0.0
@@ -210,7 +210,7 @@ class CalibrationBelief:
         self._stand_straight()
 
     def doubt_tilt(self, measured: Floats, H: Floats, R: Floats) -> None:
-        """Widen the tilt's covariance where a measurement contradicts it by far."""
+        """Widen the tilt's covariance where a measurement strongly contradicts it."""
         gap, spread = measured - H @ self.x, H @ self.P @ H.T + R
         factor = heavier(float(gap @ np.linalg.solve(spread, gap)), len(gap))
         widest = _TILT.wide**2 / max(float(self.P[0, 0]), float(self.P[1, 1]), 1e-30)
@@ -221,7 +221,7 @@ class CalibrationBelief:
     def update(self, measured: Floats, H: Floats, R: Floats, right: float = 1.0) -> float:
         """Add a measurement ``measured`` = H x + noise of covariance R; return its prior log-likelihood.
 
-        It tells nothing unless it is ``right``, by a probability: the gain is as much smaller.
+        ``right`` is the probability that the measurement is valid; it reduces the gain accordingly.
         """
         R = R / right + (1.0 / right - 1.0) * H @ self.P @ H.T
         gap = measured - H @ self.x
@@ -244,8 +244,8 @@ class CalibrationBelief:
             exact = np.repeat([self._exact[group.sigma] for group in groups], sizes)
             wide = np.repeat([group.wide for group in groups], sizes)
             shares = np.array([self._shares[group.sigma] for group in groups])
-            free = np.repeat(faulty, sizes, axis=1)  # (M, K): the component may be anything
-            # components that are as they should be are a measurement of zero, in units of their wide prior
+            free = np.repeat(faulty, sizes, axis=1)  # (M, K): whether the component may be arbitrary
+            # a nominal component acts as a measurement of zero, in units of its wide prior
             noise = np.where(free, _FREE, (exact / wide) ** 2)
             spread = P / np.outer(wide, wide) + noise[:, :, None] * np.eye(len(axes))
             pull = np.linalg.solve(spread, np.column_stack([x / wide, P / np.outer(wide, wide)])[None])
@@ -256,7 +256,7 @@ class CalibrationBelief:
             weights = np.exp(prior - 0.5 * fit - (prior - 0.5 * fit).max())
             weights /= weights.sum()
             means = x - pull[:, :, 0] @ (P / wide).T  # (M, K)
-            if groups == (_TILT,):  # a small lean is odometry's gravity
+            if groups == (_TILT,):  # a small lean is attributed to odometry's gravity
                 means = np.where(free, means, 0.0)
             variances = np.diag(P) - wide * np.einsum("ij,mji->mi", P / np.outer(wide, wide), pull[:, :, 1:]) * wide
             mean = weights @ means
@@ -272,7 +272,7 @@ class CalibrationBelief:
     def _by_shaking(self) -> float:
         """Return the log-odds of the filter's delay against the expected one, by the shaking of the body.
 
-        The filter itself learns from x, y and heading, where an error of odometry in a turn looks like a delay.
+        The filter itself uses x, y and heading, where an error of odometry in a turn looks like a delay.
         """
         sigma = math.sqrt(float(self.P[_CLOCK.axes, _CLOCK.axes][0, 0]))
         likely = np.exp(np.interp(self.x[_CLOCK.axes] + sigma * np.array([-1.0, 0.0, 1.0]), DELAYS, self.shaking))
@@ -281,7 +281,7 @@ class CalibrationBelief:
         )
 
     def _stand_straight(self) -> None:
-        """Fix mount and clock at zero for odometry that is made of the clouds: then odometry's gravity leans."""
+        """Fix mount and clock at zero where odometry is computed from the clouds: odometry's gravity takes the lean."""
         if not self._sensor_leans:
             for group in _OF_SENSOR:
                 self.x[group.axes] = self._centre[group.axes] = 0.0
@@ -289,7 +289,7 @@ class CalibrationBelief:
 
 
 def mixed(one: Calibration, other: Calibration, share: float) -> Calibration:
-    """Return the mixture of two calibrations, with the probability ``share`` of ``other``."""
+    """Return the mixture of two calibrations, with probability ``share`` of ``other``."""
 
     def mean(a: float, b: float) -> float:
         return (1.0 - share) * a + share * b
@@ -305,63 +305,63 @@ def mixed(one: Calibration, other: Calibration, share: float) -> Calibration:
 
 
 def heavier(distance: float, size: int) -> float:
-    """Return Student's t factor on the variance of a measurement, from its squared Mahalanobis distance and size."""
+    """Return Student's t factor on a measurement's variance, by its squared Mahalanobis distance and dimension."""
     return max(1.0, (_FREEDOM + distance) / (_FREEDOM + size))
 
 
 _ATTITUDE = math.radians(0.1)  # sigma of a registration's roll and pitch, added to its covariance
 _LEAN = 3.0  # ratio of the roll and pitch errors of a frame-to-frame motion to its heading error
-_HEIGHT = 2.0  # metres of a lidar above the ground that holds it, at most: a wrong attitude shifts it
-_MIN_STEP = 0.2  # metres; over less, the registrations' noise hides the motion's errors
+_HEIGHT = 2.0  # metres, largest height of a lidar above the ground: a wrong attitude shifts it by that arm
+_MIN_STEP = 0.2  # metres; on shorter steps the registrations' noise hides the motion's errors
 _MIN_TURN = math.radians(5.0)  # likewise
 
 
 class CalibrationEstimator:
-    """Estimator of the calibration from registrations.
+    """Estimator of the calibration, from registrations.
 
     Attributes:
         calibration: the applied calibration.
-        history: odometry as it came.
+        history: raw odometry.
     """
 
     def __init__(self, sensor_leans: bool = True, cloud_delay: float = 0.0, mount_drawn: bool = True) -> None:
-        """Begin with the priors; the arguments are as of a ``LocalizerConfig``."""
+        """Start from the priors; the arguments are those of ``LocalizerConfig``."""
         self._known = CalibrationBelief(sensor_leans, cloud_delay, mount_drawn)
         self.history, self._delays = OdometryHistory(), DelaySearch()
-        self._supposed: CalibrationBelief | None = None  # belief if the place that leads a search is right
+        self._supposed: CalibrationBelief | None = None  # belief if the leading place of a search is right
         self._probability = 0.0  # that the leading place is right
         self._apply()
 
     @property
     def lean_prior(self) -> float:
-        """Log-probability of the applied lean where a place that only leads a search has told it, else 0."""
+        """Log-probability of the applied lean if only a leading place of a search has shown it, else 0."""
         if self._supposed is None:
             return 0.0
         known = self._known.applied()
         return lean_prior(self.calibration.leans_from(known), known.sigma_tilt)
 
     def learn(self, earlier: Calibration, same_run: bool = False) -> None:
-        """Take over the components of an earlier calibration that have a smaller sigma than the present ones.
+        """Adopt the components of an earlier calibration whose sigma is below the present one.
 
-        Mount and clock may be others since, unless it is of the ``same_run``.
+        Mount and clock may have changed since, unless it is of the ``same_run``.
         """
         self._supposed = None
         self._known.learn(earlier, same_run)
         self._apply()
 
     def forget_leader(self) -> None:
-        """Forget the measurement at a place that led a search."""
+        """Forget the measurement at the place that led a search."""
         self._supposed = None
         self._apply()
 
     def forget_tilt(self) -> None:
-        """Forget the lean of the sensor: it was measured on ground that is not the survey's."""
+        """Forget the lean of the sensor, which was measured on changed ground."""
         self._supposed = None
         self._known.forget_tilt()
         self._apply()
 
     def begin_odometry(self) -> None:
-        """Forget the lean of the odometry frame, as a new one begins; the robot's constants stay."""
+        """Forget the lean of the odometry frame, as a new one starts; the robot's constants stay."""
         self.history, self._delays = OdometryHistory(), DelaySearch()
         self._supposed = None
         self._known.begin_odometry()
@@ -370,7 +370,7 @@ class CalibrationEstimator:
     def measure_attitude(self, T_map_cloud: Pose, T_odom_body: Pose, variance: float) -> None:
         """Add the attitude of a registration at the tracked place (eq. C1).
 
-        ``T_map_cloud`` (4, 4) is of the cloud in the sensor's axes, the prior removed, ``T_odom_body`` (4, 4) of the
+        ``T_map_cloud`` (4, 4) is of the cloud in the sensor's axes, without the prior, ``T_odom_body`` (4, 4) of the
         same frame, ``variance`` of the registration's roll and pitch, rad^2.
         """
         self._supposed = None
@@ -378,26 +378,26 @@ class CalibrationEstimator:
         self._apply()
 
     def suppose_attitude(self, T_map_cloud: Pose, T_odom_body: Pose, variance: float, probability: float) -> None:
-        """Add the attitude at a place that is right with a ``probability``, in place of the previous supposition.
+        """Add the attitude at a place that is right with a ``probability``, replacing the previous supposition.
 
-        A search registers the same scans again, so suppositions do not add up. Args as :meth:`measure_attitude`.
+        A search registers the same scans again, so suppositions do not accumulate. Args as :meth:`measure_attitude`.
         """
         self._supposed, self._probability = deepcopy(self._known), probability
         _measure_attitude(self._supposed, T_map_cloud, T_odom_body, variance)
         self._apply()
 
     def widen_mount(self) -> None:
-        """Suppose that the sensor may have been turned or shifted on the body."""
+        """Widen the mount, as the sensor may have been turned or shifted on the body."""
         self._delays.forget_motions()
         self._widen(_MOUNT)
 
     def widen_clock(self) -> None:
-        """Suppose that the clock of clouds or odometry may have taken a step."""
+        """Widen the delay, as the clock of clouds or odometry may have taken a step."""
         self._delays = DelaySearch()
         self._widen((_CLOCK,))
 
     def rescale(self, factor: float, sigma: float) -> None:
-        """Take over a step of odometry's scale by a factor, less or more sure by ``sigma``: no walk is so fast."""
+        """Apply a step of odometry's scale by a factor with relative ``sigma``: the random walk is too slow for it."""
         self._supposed = None
         self._known.rescale(factor, sigma)
         self._apply()
@@ -408,10 +408,10 @@ class CalibrationEstimator:
         self._apply()
 
     def search_delay(self) -> None:
-        """Judge the motions after which odometry has gone on for a second; call it at each frame.
+        """Judge the motions that odometry has passed by a second; call it at each frame.
 
-        The state begins anew at another delay if they speak for it. Where odometry is late it learns from them only
-        now, as until then odometry at the clouds' moments was not known.
+        The state restarts at another delay if they favour it. Where odometry is late the filter learns from motions
+        only here, as odometry at the moments of the clouds was unknown until now.
         """
         judged = self._delays.judge(self.history)
         for belief in filter(None, (self._known, self._supposed)):
@@ -440,14 +440,14 @@ class CalibrationEstimator:
         """Add the motion between two registrations (eq. C2); return ``step`` corrected by the new calibration.
 
         Args:
-            T_map_before: (4, 4) earlier pose, the prior removed.
+            T_map_before: (4, 4) earlier pose, without the prior.
             T_map_body: (4, 4) later pose, likewise.
             step: (4, 4) odometry between them, corrected by the calibration of its time.
             noise: (3, 3) covariance of the motion's (x, y, heading), body's axes at the start, without the
                 calibration's.
-            moments: of both poses; without, the motion does not tell a delay. Where the rates are not known (NaN) it is
-                not used: a robot that begins to move looks as if its clouds were late.
-            contradicts: it is off by far; a slip may be it, so it tells nothing of mount and clock.
+            moments: of both poses; without them the motion shows no delay. A motion with unknown rates (NaN) is not
+                used: a robot that starts to move looks as if its clouds were late.
+            contradicts: the motion contradicts odometry, perhaps by a slip, so it shows nothing of mount and clock.
         """
         driven = float(np.linalg.norm(step[:3, 3]))
         turned = abs(float(log_so3(step[:3, :3])[2]))
@@ -471,12 +471,12 @@ class CalibrationEstimator:
         return pose_from(exp_so3(np.array([0.0, 0.0, moved[2]])) @ step[:3, :3], t)
 
     def _learn_motion(self, motion: Pose, step: Pose, J: Floats, noise: Floats, applied: Calibration) -> None:
-        """Add a motion to the beliefs; ``applied`` has corrected it and ``step``."""
+        """Add a motion to the beliefs; ``applied`` is the calibration that it and ``step`` were corrected with."""
         turned = log_so3(motion[:3, :3] @ step[:3, :3].T)
         gap = np.append(motion[:2, 3] - step[:2, 3], turned[2])
         H = np.zeros((3, SIZE))
         H[:, _MOTION] = J
-        # clouds that were levelled by the attitude of another time are bent, and their registration is off by as much
+        # clouds levelled by the attitude of another time are bent, which biases their registration as much
         bent = np.diag([turned[1], turned[0], 0.0]) * _HEIGHT
         self._update(gap + J @ _motion_part(applied), H, noise + bent**2)
 
@@ -491,8 +491,8 @@ class CalibrationEstimator:
             step: (4, 4) odometry's motion, corrected by the calibration of its time.
             variances: (6,) of odometry's random walk over the step, (rx, ry, rz, x, y, z).
             sigmas: (6,) of ``motion``, (rx, ry, rz, x, y, z).
-            moments: as of :meth:`measure_motion`.
-            right: probability that ``motion`` is no failed registration.
+            moments: as in :meth:`measure_motion`.
+            right: probability that the registration has not failed.
         """
         t, before = step[:3, 3], self.calibration
         applied = np.array([before.roll, before.pitch])
@@ -503,14 +503,14 @@ class CalibrationEstimator:
         rise = np.array([motion[2, 3] - t[2] + H[0, :2] @ applied])
         self._update(rise, H, np.array([[variances[5] + sigmas[5] ** 2]]), right)
         H = np.zeros((2, SIZE))
-        H[:, :2] = (motion[:3, :3] - np.eye(3))[:2, :2]  # the lidar's heading, which is better than odometry's
+        H[:, :2] = (motion[:3, :3] - np.eye(3))[:2, :2]  # by the lidar's heading, which is better than odometry's
         self._update(turned[:2] + H[:, :2] @ applied, H, np.diag(variances[:2] + (_LEAN * sigmas[:2]) ** 2), right)
         noise = np.diag(variances[[3, 4, 2]] + sigmas[[3, 4, 2]] ** 2 / right)
         level = self.calibration.T_body_cloud @ inverse(before.T_body_cloud)
         return self.measure_motion(np.eye(4), level @ motion @ inverse(level), step, noise, moments)
 
     def _update(self, measured: Floats, H: Floats, R: Floats, right: float = 1.0) -> None:
-        """Add a measurement to both beliefs, as :meth:`CalibrationBelief.update`."""
+        """Add a measurement to both beliefs, as in :meth:`CalibrationBelief.update`."""
         likelihood = self._known.update(measured, H, R, right)
         if self._supposed is not None:
             ratio = self._supposed.update(measured, H, R, right) - likelihood
@@ -525,12 +525,12 @@ class CalibrationEstimator:
 
 
 def _waits(applied: Calibration) -> bool:
-    """Return whether odometry is so late that a motion waits for it."""
+    """Return whether odometry is so late that a motion has to wait for it."""
     return applied.delay <= -RESOLUTION
 
 
 def _motion_part(calibration: Calibration) -> Floats:
-    """Return the values (6,) of the components that show in a motion."""
+    """Return the values (6,) of the components that affect a motion."""
     c = calibration
     return np.array([c.scale, c.turn, c.delay, c.heading, c.lever_x, c.lever_y])
 
@@ -548,5 +548,5 @@ def _measure_attitude(belief: CalibrationBelief, T_map_cloud: Pose, T_odom_body:
 
 
 def tilt_variance(covariance: Floats) -> float:
-    """Return the variance of roll or pitch, rad^2, of a covariance (6, 6) over (rx, ry, rz, x, y, z)."""
+    """Return the mean variance of roll and pitch, rad^2, in a covariance (6, 6) over (rx, ry, rz, x, y, z)."""
     return 0.5 * float(covariance[0, 0] + covariance[1, 1])

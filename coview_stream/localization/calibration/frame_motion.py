@@ -4,12 +4,12 @@ The newest keyframe is registered to the previous one. With ε the uncorrected t
 motion in the body's axes, s and w as in :mod:`coview_stream.localization.calibration.estimator`, the registered motion
 differs from odometry's (hand-eye calibration, to first order) by
 
-* t x ε + s t in position. The components along the path (s) and along the body's z (ε) are used; the third is the
+* t x ε + s t in position. The components along the path (s) and along the body's z (ε) are used; the third shows the
   heading of the sensor on the body, which is not estimated.
-* (R - I) ε + w |t| z in rotation: a robot that turns also observes its roll (eq. C4).
+* (R - I) ε + w |t| z in rotation: a turning robot also observes its roll (eq. C4).
 
-The registration also corrects the motion itself, as drifting odometry smears the virtual scan of many keyframes. Both
-count by their variances, and a registration that contradicts odometry counts less.
+The registration also corrects the motion itself, as drift of odometry smears the virtual scan of many keyframes. Both
+are weighted by their variances, and a registration that contradicts odometry counts less.
 """
 
 from __future__ import annotations
@@ -38,17 +38,17 @@ from coview_stream.localization.registration.surfaces import (
 )
 
 # set by hand
-_POORER = 3.0  # times the configured drift that odometry may have
+_POORER = 3.0  # allowed multiple of odometry's configured drift
 _FAILS = 0.1  # probability that a registration fails; its sigmas then, radians and metres per metre
 _FAILED_ANGLE = math.radians(3.0)
 _FAILED = 0.15
 
 Variances = Callable[[float, float], Floats]
-"""Variances (6,) over (rx, ry, rz, x, y, z) of odometry's random walk, of metres driven and radians turned."""
+"""Variances (6,) over (rx, ry, rz, x, y, z) of odometry's random walk, by metres driven and radians turned."""
 
 
 class _Reference(NamedTuple):
-    """Keyframe that the next one is registered to."""
+    """Keyframe to which the next one is registered."""
 
     points: Points  # (K, 3) on surfaces, sensor's axes
     normals: Floats32  # (K, 3) of the points
@@ -66,7 +66,7 @@ class FrameMotion:
         self._reference: _Reference | None = None
 
     def clear(self) -> None:
-        """Forget the keyframe: odometry may have jumped."""
+        """Forget the keyframe, as odometry may have jumped."""
         self._reference = None
 
     def is_due(self, T_odom_body: Pose) -> bool:
@@ -84,7 +84,7 @@ class FrameMotion:
         Args:
             points: (N, 3) float32, one per voxel, sensor's axes.
             T_odom_body: (4, 4) odometry, corrected by the estimator's calibration.
-            estimator: gets the motion as a measurement.
+            estimator: receives the motion as a measurement.
             drift: of odometry.
             moment: of the frame.
         """
@@ -94,7 +94,7 @@ class FrameMotion:
             if seen is not None:
                 both = reference.moment, moment
                 fused = _corrected(reference.T_odom_body, T_odom_body, seen, estimator, drift, both)
-                T_odom_body = orthonormal(fused)  # each keyframe is measured from the last: errors would double
+                T_odom_body = orthonormal(fused)  # each keyframe is relative to the last: errors would double
         self._reference = _Reference(*surface_points(points), T_odom_body, moment)
         return T_odom_body
 
@@ -103,7 +103,7 @@ class FrameMotion:
     ) -> tuple[Pose, Floats] | None:
         """Return the registered pose (4, 4), odometry <- body, and its covariance; None if registration fails.
 
-        The covariance (6, 6) is over (rx, ry, rz, x, y, z), odometry's axes, of the pairs alone.
+        The covariance (6, 6) is over (rx, ry, rz, x, y, z), odometry's axes, without the prior.
         """
         far = float(np.linalg.norm(T_odom_body[:3, 3] - reference.T_odom_body[:3, 3]))
         if len(reference.points) < MIN_PAIRS or far > LONGEST:
@@ -130,7 +130,7 @@ def _corrected(
     before: Pose, T_odom_body: Pose, seen: tuple[Pose, Floats], estimator: CalibrationEstimator, drift: Variances,
     moments: Moments,
 ) -> Pose:  # fmt: skip
-    """Give the estimator a registered motion from ``before`` (4, 4); return the newest odometry (4, 4), fused."""
+    """Pass a registered motion from ``before`` (4, 4) to the estimator; return the newest odometry (4, 4), fused."""
     T_registered, covariance = seen
     level = estimator.calibration.T_body_cloud
     motion, step = inverse(before) @ T_registered, inverse(before) @ T_odom_body
@@ -151,14 +151,14 @@ def _corrected(
 def _probability_right(motion: Pose, step: Pose, variances: Floats, noise: Floats, calibration: Calibration) -> float:
     """Return the probability that a registration succeeded, by its difference from odometry's ``step``.
 
-    A failed one (a street looks alike along its length, a lorry drives away) may end anywhere within its reach.
+    A failed one (a uniform street, a lorry that drives away) may end anywhere within its reach.
     """
     far = float(np.linalg.norm(step[:3, 3]))
     gap = np.concatenate([log_so3(motion[:3, :3] @ step[:3, :3].T), motion[:3, 3] - step[:3, 3]])
     tilt, sigma = calibration.sigma_tilt * far, calibration.sigma_heading
     constant = np.array([0.0, 0.0, calibration.sigma_turn * far, calibration.sigma_scale * far, sigma * far, tilt])
     right = _POORER**2 * variances + constant**2 + noise**2
-    turn = 1.0 - math.cos(yaw_of(motion)) + abs(math.sin(yaw_of(motion)))  # share of a lean that shows in rotation
+    turn = 1.0 - math.cos(yaw_of(motion)) + abs(math.sin(yaw_of(motion)))  # share of a lean that appears as rotation
     right[:2] += (calibration.sigma_tilt * turn) ** 2
     failed = right + np.array([_FAILED_ANGLE] * 3 + [_FAILED * far] * 3) ** 2
     ratio = math.log(_FAILS / (1.0 - _FAILS)) + 0.5 * float(
@@ -168,9 +168,9 @@ def _probability_right(motion: Pose, step: Pose, variances: Floats, noise: Float
 
 
 def _fused(T_odometry: Pose, T_seen: Pose, variances: Floats, sigmas: Floats) -> Pose:
-    """Return odometry's pose (4, 4), moved and turned about the vertical towards the lidar's by their variances.
+    """Return odometry's pose (4, 4), shifted and turned about the vertical towards the lidar's by their variances.
 
-    ``sigmas`` (6,) of the lidar's, (rx, ry, rz, x, y, z).
+    ``sigmas`` (6,) are the lidar's, over (rx, ry, rz, x, y, z).
     """
     moved = T_odometry.copy()
     for axis in range(3):
@@ -182,6 +182,6 @@ def _fused(T_odometry: Pose, T_seen: Pose, variances: Floats, sigmas: Floats) ->
 
 
 def _share(gap: float, odometry: float, lidar: float) -> float:
-    """Return odometry's share of a gap, by both variances; the lidar's has heavier tails."""
+    """Return the share of a gap attributed to odometry, by both variances; the lidar's has heavier tails."""
     lidar = float(heavier(gap**2 / (odometry + lidar), 1)) * lidar
     return odometry / (odometry + lidar)

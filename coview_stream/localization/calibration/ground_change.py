@@ -1,18 +1,18 @@
-"""Changed ground: dug, filled, piled up or snowed on by decimetres to metres since the survey; a Bayes filter tells.
+"""Bayes filter for changed ground: dug, filled, piled up or snowed on by decimetres to metres since the survey.
 
 The unknown is h, the height of odometry's frame on the map; it walks by odometry's drift. The ground around the robot
-is of one of two kinds: *as surveyed* (S), most patches of it lie where the survey has them at the right h; or *changed*
-(C), as in a pit, where patches tell nothing about h. A robot comes upon changed ground once in a kilometre and
-leaves it within some dozen metres. Two things are observed once per view:
+is of one of two kinds: *as surveyed* (S), with most patches at the survey's height for the right h; or *changed* (C),
+as in a pit, with patches that tell nothing about h. A robot meets changed ground once in a kilometre and leaves it
+within some dozen metres. Each view gives two observations:
 
-* Patches of ground, by their height above the survey's at the registered pose. Under S their likelihood is greatest at
-  the h that puts most of them on the survey's ground. Changed ground is of another shape than the survey's, or, as a
-  level site dug by two metres, a copy of it at another height; that becomes less probable by the metre.
-* Structure, under both kinds: roofs, crowns and the ends of walls lie where the survey has them at the right h alone.
+* Patches of ground, by their height above the survey's at the registered pose. Under S the likelihood is greatest at
+  the h that puts most of them on the survey's ground. Changed ground has another shape than the survey's, or is a copy
+  of it at another height, like a level site dug by two metres; a copy becomes less probable by the metre.
+* Structure, under both kinds: roofs, crowns and the ends of walls fit the survey only at the right h.
 
-So the height goes on by odometry into a pit whose ramp the survey does not have, follows structure where that shows a
-height, and comes back onto ground as surveyed. Where nothing tells, all heights stay possible, and the variance says
-so. Changed ground is left out of registration: it would shift the robot in height and look like a lean of the sensor.
+So in a pit whose ramp the survey lacks the height follows odometry, or structure where that shows a height, and returns
+to ground as surveyed. Without evidence all heights stay possible, which the variance shows. Changed ground is left out
+of registration: it would shift the robot in height and look like a lean of the sensor.
 """
 
 from __future__ import annotations
@@ -33,72 +33,72 @@ from coview_stream.localization.registration.clouds import STRUCTURE_HEIGHT, Loc
 _STEP = 0.1  # metres between the heights
 _HEIGHTS = _STEP * np.arange(-40, 41)  # metres above the registered one
 _SHIFTS = 0.2 * np.arange(-17, 18)  # metres at which structure is compared
-_LEAST, _DEEPEST = 0.35, 5.0  # metres: smaller changes are a ground offset; no ground changes by more
+_LEAST, _DEEPEST = 0.35, 5.0  # metres: smaller changes are ground offsets, larger ones do not occur
 _DEPTH = 1.5  # metres, mean of a change beyond the least
 _SITES = 2e-2  # share of the sites where the robot starts on changed ground
-_BECOMES, _ENDS = 1e-3, 0.03  # probability per metre that changed ground begins, and that it ends: sites are small
-_COPY = 0.1  # per metre: how fast a copy of the survey's ground becomes improbable
-_BROKEN = 5.0  # nats against ground that copies the survey's, but now at another height
-_SURE = 0.9  # probability of a height, within half a metre, to which the robot is moved
-_ANEW = 1e-6  # probability per metre that all this is wrong
+_BECOMES, _ENDS = 1e-3, 0.03  # probability per metre that changed ground starts, and that it ends: sites are small
+_COPY = 0.1  # nats per metre against a copy of the survey's ground
+_BROKEN = 5.0  # nats against a copy of the survey's ground whose height changes
+_SURE = 0.9  # probability of another height, within half a metre, above which the robot is moved there
+_ANEW = 1e-6  # probability per metre that the whole belief is wrong
 _START = 0.1  # metres, one sigma of a registered height on ground as surveyed
 
-_PATCH, _FEW = 4.0, 3  # metres; points of a patch: fewer say nothing
+_PATCH, _FEW = 4.0, 3  # metres; least points of a patch
 _INDEPENDENT = 0.1  # observations per patch: ground within a dozen metres is dug together
 _SURVEY, _LEAN = 0.07, math.radians(0.5)  # one sigma of a patch's height, metres, and of the cloud's attitude
 _CHANGES = ((0.3, 0.5), (1.5, 0.5))  # metres, mean of a change by plants and of one by diggers; shares
-_KEPT = np.array([0.3, 0.5, 0.7, 0.85, 0.95, 0.99])  # share of the patches that are as surveyed, under S
+_KEPT = np.array([0.3, 0.5, 0.7, 0.85, 0.95, 0.99])  # shares of patches that are as surveyed, under S
 _KEPT_PRIOR = np.array([0.02, 0.03, 0.05, 0.1, 0.3, 0.5])
-_ODDS = 4.0  # most that a patch says against its neighbours, in nats
-_ON_MAP = 0.5  # metres to a map point that a point lies on
+_ODDS = 4.0  # nats, most evidence of a single patch
+_ON_MAP = 0.5  # metres from a point that lies on the map to a map point
 
-# structure of undisturbed sites and of one with half of its buildings gone or new preferred no height metres off by
-# more than 4 nats with these
-_STRUCTURE = 0.3  # observations per patch of structure, as of a ground offset
-_SEEN = 10.0  # metres of driving over which the same structure is seen
-_BLUR = 5  # shifts, within which structure from below differs from structure from above
-_VIEWED = 0.07  # metres, one sigma of a height without ground
+# with these, structure of undisturbed sites and of one with half of its buildings gone or new preferred no height
+# metres off by more than 4 nats
+_STRUCTURE = 0.3  # observations per patch of structure, as for a ground offset
+_SEEN = 10.0  # metres of driving over which the same structure stays in view
+_BLUR = 5  # shifts by which structure from below differs from structure from above
+_VIEWED = 0.07  # metres, one sigma of a height by structure alone
 _ELSEWHERE = np.abs(_HEIGHTS) > np.array([[1.5 * _STEP], [_LEAST]])
-"""(2, H) heights that are not the registered one, by kind: ground as surveyed shows decimetres, structure does not."""
+"""(2, H) heights other than the registered one, by kind: surveyed ground resolves decimetres, structure does not."""
 
 
 class GroundChange:
     """Belief over the robot's height and the kind of ground around it.
 
     Attributes:
-        share: of the newest scan's ground that has been left out as changed.
+        share: of the newest scan's ground that was left out as changed.
         metres: median height of that ground above the survey's, if it is most of the ground; 0 otherwise.
     """
 
     def __init__(self, field: kernels.FieldMap) -> None:
-        """Hold the present ground against that of a map's ``field``."""
+        """Compare the present ground with that of a map's ``field``."""
         self._field = field
         self.clear()
 
     def clear(self) -> None:
-        """Forget all: the place is another."""
+        """Reset, for another place."""
         self.share = self.metres = 0.0
         self._scan: RegistrationCloud | None = None  # the newest, with all of its ground
         self._started = False
         self._T_map_source = np.eye(4)  # of the newest lesson
-        self._h = 0.0  # metres by which registrations have raised the robot above odometry's way
-        self._origin = 0.0  # of these, from which the heights count: a multiple of their step
-        self._copied = 0.0  # likewise: the height at which the patches lately fitted the survey best
+        self._h = 0.0  # metres by which registrations have raised the robot above odometry's path
+        self._origin = 0.0  # value of _h at the zero of the heights: a multiple of their step
+        self._copied = 0.0  # value of _h at which the newest patches fitted the survey best
         size = np.abs(_HEIGHTS) - _LEAST
         dug = np.where(size > 0.0, np.exp(-size / _DEPTH), 0.0)
         as_surveyed = np.exp(-0.5 * (_HEIGHTS / _START) ** 2)
         self._prior = np.stack([(1.0 - _SITES) * as_surveyed / as_surveyed.sum(), _SITES * dug / dug.sum()])
         self._kinds = self._prior.copy()  # (2, H) probabilities of S and C by the patches
-        self._structure = np.zeros(len(_HEIGHTS))  # log-likelihood of structure lately seen
+        self._structure = np.zeros(len(_HEIGHTS))  # log-likelihood of recently seen structure
 
     def without_changed(
         self, cloud: RegistrationCloud, T_map_source: Pose, position: Floats, target: LocalMap
     ) -> RegistrationCloud:
-        """Return a scan without the ground that does not lie on the survey's, by its predicted pose.
+        """Return a scan without the ground that differs from the survey's, by its predicted pose.
 
         Args:
             cloud: the scan.
-            T_map_source: (4, 4) its predicted pose. The first one comes from the search, and is not held against it.
+            T_map_source: (4, 4) its predicted pose. The first scan has the search's pose and is left whole.
             position: (3,) of the body, the scan's frame.
             target: the map around.
         """
@@ -121,19 +121,19 @@ class GroundChange:
         )  # fmt: skip
 
     def learn(self, T_map_source: Pose, position: Floats, target: LocalMap, driven: float, variance: float) -> float:
-        """Learn from a believed registration of the newest scan; return metres by which the robot has to rise.
+        """Learn from a believed registration of the newest scan; return the metres by which the robot has to rise.
 
         Args:
             T_map_source: (4, 4) the scan's pose, as registered.
             position: (3,) of the body, the scan's frame.
             target: the map around.
-            driven: metres since the last lesson.
+            driven: metres since the last call.
             variance: of the height that odometry has gained since then, metres^2.
         """
         if self._scan is None:
             return 0.0
         if self._started:
-            # by the attitude of then: a frame of odometry that leans goes up or down by itself
+            # by the previous attitude, as a leaning odometry frame rises or sinks by itself
             before, now = (transform(T, position[None])[0, 2] for T in (self._T_map_source, T_map_source))
             self._h += float(now - before)
             self._walk(driven, variance)
@@ -145,7 +145,7 @@ class GroundChange:
         same = patches.likelihoods(_HEIGHTS)
         changed = np.full(len(_HEIGHTS), patches.other_shape())
         fits = float(_HEIGHTS[same.argmax()])
-        moved = abs(self._h + fits - self._copied) > 2.0 * _STEP  # a pit that ends is no copy that goes on
+        moved = abs(self._h + fits - self._copied) > 2.0 * _STEP  # the end of a pit does not continue a copy
         copied = np.abs(_HEIGHTS - fits) > _LEAST
         changed[copied] = np.maximum(changed[copied], same.max() - _COPY * driven - _BROKEN * moved)
         self._copied = self._h + fits
@@ -165,20 +165,19 @@ class GroundChange:
 
     @property
     def others(self) -> OtherHeights:
-        """Heights that are possible beside the registered one."""
+        """Other possible heights than the registered one."""
         if not self._started:
             return NO_OTHER
         off = (self._belief() * _ELSEWHERE).sum(axis=0)
-        beyond = np.cumsum(
-            (off + off[::-1])[: len(off) // 2]
-        )  # probability of each distance or more, the farthest first
+        # probability of each distance or more, from the farthest
+        beyond = np.cumsum((off + off[::-1])[: len(off) // 2])
         rare = int((beyond <= 0.5 * RISK).sum())
         reach = abs(_HEIGHTS[rare]) if rare < len(beyond) else 0.0
         return OtherHeights(float(off @ _HEIGHTS**2), float(reach))
 
     @property
     def alone(self) -> float:
-        """Variance of the height where it stands on structure alone, metres^2; see RegistrationCloud.groundless."""
+        """Variance that the height gains where only structure holds it, metres^2; see RegistrationCloud.groundless."""
         return self.share**3 * _VIEWED**2
 
     def _belief(self) -> Floats:
@@ -187,7 +186,7 @@ class GroundChange:
         return np.asarray(belief / belief.sum())
 
     def _rise(self) -> float:
-        """Return metres to the probable height, if it is another than the registered one, and count from there."""
+        """Return metres to the probable height, if it is not the registered one, and recentre the heights there."""
         belief = self._belief()
         heights, elsewhere = belief.sum(axis=0), (belief * _ELSEWHERE).sum(axis=0)
         best = int(np.convolve(elsewhere, np.ones(7), mode="same").argmax())
@@ -201,7 +200,7 @@ class GroundChange:
         return rise
 
     def _walk(self, driven: float, variance: float) -> None:
-        """Let the height drift by a variance, and the ground change its kind, over ``driven`` metres."""
+        """Let the height diffuse by a variance, and the kind of ground change, over ``driven`` metres."""
         out = min(0.3, 0.5 * variance / _STEP**2)
         known = (1.0 - 2.0 * out) * self._kinds
         known[:, 1:] += out * self._kinds[:, :-1]
@@ -212,7 +211,7 @@ class GroundChange:
         self._kinds = (1.0 - anew) * known + anew * self._prior
 
     def _count_on(self) -> None:
-        """Let the heights count from the present one; those beyond the ends are forgotten."""
+        """Recentre the heights at the present one; those beyond the ends are forgotten."""
         steps = round((self._h - self._origin) / _STEP)
         if steps:
             rows = np.arange(len(_HEIGHTS)) + steps
@@ -224,12 +223,12 @@ class GroundChange:
 
 
 class _Patches:
-    """Patches of the present ground of a scan at a pose.
+    """Ground patches of a scan at a pose.
 
     Attributes:
         off: (N,) metres of the scan's points above the survey's ground; NaN where it has none.
-        height: (P,) median of it on the ground of each patch.
-        dug: metres that the survey's ground lies above the deepest tenth of the patches.
+        height: (P,) median of ``off`` over the ground of each patch.
+        dug: metres from the deepest tenth of the patches up to the survey's ground.
     """
 
     def __init__(
@@ -244,7 +243,7 @@ class _Patches:
         self._cell = (cell[:, 0] - low[0]) * columns + cell[:, 1] - low[1]
         self.off: Floats32 = points[:, 2] - kernels.ground_heights(field, points)
         ground = ~cloud.above & (np.abs(self.off) < _DEEPEST)  # False where the survey has no ground
-        # where the ground is hidden, the lowest points of a wall or a crown look like ground; they lie on the map's
+        # where the ground is hidden, the lowest points of walls and crowns look like ground, but lie on map points
         apart = np.flatnonzero(ground & (np.abs(self.off) > _LEAST))
         ground[apart] = kernels.nearest(target.grid, points[apart], _ON_MAP)[0] >= _ON_MAP
         chosen = np.flatnonzero(ground)
@@ -259,20 +258,20 @@ class _Patches:
         self.dug = max(0.0, -float(deep[-1])) if len(deep) else 0.0
 
     def likelihoods(self, heights: Reals) -> Floats:
-        """Log-likelihoods (H,) of ground as surveyed if the robot stands ``heights`` (H,) metres higher."""
+        """Log-likelihoods (H,) of ground as surveyed if the robot is raised by ``heights`` (H,) metres."""
         logs, _, _ = self._shares(heights)
         top = logs.max(axis=0)
         return np.asarray(top + np.log(_KEPT_PRIOR @ np.exp(logs - top)))
 
     def other_shape(self) -> float:
-        """Log-likelihood of ground that has been changed to another shape, at any height."""
+        """Log-likelihood of ground that was changed to another shape, at any height."""
         off = np.abs(self.height - np.median(self.height)) if len(self.height) else self.height
         return -_INDEPENDENT * float((off + math.log(2.0)).sum())
 
     def changed(self, probability: float) -> Bools:
-        """Tell which points lie on patches that are probably changed, if the pose is right.
+        """Return whether each point lies on a patch that is probably changed, if the pose is right.
 
-        ``probability`` is that of the changed kind of ground. A patch goes with its neighbours unless it is clear.
+        ``probability`` is that of changed ground. A patch without clear evidence follows its neighbours.
         """
         if not len(self.height):
             return np.zeros(len(self._cell), dtype=bool)
@@ -290,7 +289,7 @@ class _Patches:
         return np.asarray((mean < 0.0)[self._cell])
 
     def _shares(self, heights: Reals) -> tuple[Floats, Floats, Floats]:
-        """Log-likelihoods (K, H) by the share that is as surveyed; densities (H, P) as surveyed and as changed."""
+        """Log-likelihoods (K, H) by the share of surveyed patches; densities (H, P) as surveyed and as changed."""
         at = self.height + heights[:, None]
         z = at / self._sigma
         same = (0.9 * np.exp(-0.5 * z**2) + 0.1 / 3.0 * np.exp(-(z**2) / 18.0)) / (self._sigma * math.sqrt(2 * math.pi))
@@ -305,7 +304,7 @@ def _blurred(values: Floats) -> Floats:
 
 
 def _with_neighbours(values: Floats) -> Floats:
-    """Return the sums (H, W) of each cell and its eight neighbours: zero where all are, unlike a running sum."""
+    """Return the sums (H, W) over each cell and its eight neighbours: exact zeros stay zero, unlike in running sums."""
     rows = np.pad(values, 1)
     rows = rows[:-2] + rows[1:-1] + rows[2:]
     return np.asarray(rows[:, :-2] + rows[:, 1:-1] + rows[:, 2:])

@@ -1,13 +1,13 @@
-"""Ground offset: height of the present ground above the survey's, as grass or snow raise it.
+"""Ground offset: height of the present ground, raised by grass or snow, above the survey's.
 
-Registration would put the present ground on the survey's, and so the robot too low by the offset. Structure reveals it:
-structure and ground are compared with the map at shifts up and down, and the difference of their best shifts is the
-offset. The robot's height then follows structure; where no structure shows a height, the offset is zero.
+Registration would put the present ground on the survey's, and so the robot too low by the offset. Structure reveals
+this: structure and ground are compared with the map at vertical shifts, and the offset is the difference of their best
+shifts. The robot's height then follows structure; where no structure shows a height, the offset is zero.
 
 Most sites have no offset, and structure seen from below differs by centimetres from a survey from above. So two
 hypotheses are compared: no offset beyond the survey's error, or one of some decimetres. The more probable one holds, as
-a mean of both would raise every site without an offset. Offsets below two decimetres hardly differ from none. Ground
-below the survey's looks like trees that have grown since, which is more probable: little of it is corrected.
+their mean would raise every site without an offset. Offsets below two decimetres hardly differ from none. Ground below
+the survey's looks like trees that have grown since, which is more probable: little of it is corrected.
 """
 
 from __future__ import annotations
@@ -20,25 +20,25 @@ from coview_stream.geometry.transforms import Points, Pose, transform
 from coview_stream.localization.registration.clouds import LocalMap, RegistrationCloud
 
 # set by hand on a simulated town and campus with their ground lifted by -0.2, 0 and 0.3 m, and checked on three real
-# runs and a real forest plot changed likewise (docs/tracking.md); no command prints it
+# runs and a real forest plot lifted likewise (docs/tracking.md); no command prints it
 _SHIFTS = 0.1 * np.arange(-7, 8)  # metres
 _OFFSETS = 0.02 * np.arange(-25, 26)  # metres
 _REACH = 0.5  # metres to a map point
 _WIDTH = 0.15  # metres off its plane at which a point is half as good
 _POINTS = 400  # of structure and of ground
 _PATCH = 4.0  # metres: a patch of structure is one observation
-_FEW = 4  # points of a patch; fewer say nothing
-_CHANCE = 0.1  # share of a patch that fits anywhere
-_ANY_HEIGHT = 0.3  # likewise, metres higher or lower
-_NONE = 0.98  # prior probability of none: 0.9 left drives through changed campuses (bench tracking) 0.1 m off in height
+_FEW = 4  # least points of a patch
+_CHANCE = 0.1  # share of a patch that fits at any shift
+_ANY_HEIGHT = 0.3  # likewise, over shifts of metres
+_NONE = 0.98  # prior of no offset: 0.9 left drives through changed campuses (bench tracking) 0.1 m off in height
 _NONE_SIGMA, _SIGMA = 0.02, 0.2  # metres, of the two hypotheses
-_VIEWED = 0.07  # metres, one sigma of the height difference of structure seen from below and from above
-_INDEPENDENT = 0.3  # observations per patch: neighbours err alike
-_MEMORY = 0.9  # weight of earlier registrations, from one to the next
-_FOLLOWED = 0.25  # share of a change per registration: the height follows smoothly
+_VIEWED = 0.07  # metres, one sigma of the height difference between structure seen from below and above
+_INDEPENDENT = 0.3  # observations per patch: neighbours have common errors
+_MEMORY = 0.9  # decay of earlier registrations, per registration
+_FOLLOWED = 0.25  # share of a change applied per registration, for a smooth height
 _STILL, _CHANGED = 0.6, 0.1  # probability that an earlier offset still holds; its sigma, metres
 
-# growth since the survey looks as if the ground had sunk: a nuisance, summed over
+# growth since the survey looks as if the ground had sunk: a nuisance parameter, summed over
 _HEIGHTS, _PARTS = 0.1 * np.arange(1, 7), (0.5, 1.0)  # metres of growth, share of the patches
 _GROWTHS = np.array([(0.0, 0.0), *((height, part) for height in _HEIGHTS for part in _PARTS)])
 _GROWN = 0.5  # prior probability of any growth
@@ -57,7 +57,7 @@ class GroundOffset:
         self.restore(0.0)
 
     def restore(self, metres: float) -> None:
-        """Begin, now and at every accepted place, with an earlier offset of this site as a third hypothesis.
+        """Restart, now and at every accepted place, with an earlier offset of this site as a third hypothesis.
 
         It is the most probable one until registrations contradict it; an offset near zero adds none.
         """
@@ -69,7 +69,7 @@ class GroundOffset:
         self.clear()
 
     def clear(self) -> None:
-        """Forget the registrations: the place is another."""
+        """Forget the registrations of the previous place."""
         self._likelihoods, self._views = np.zeros((len(_GROWTHS), len(_OFFSETS))), 0
         self.metres = self._weigh()
 
@@ -83,7 +83,7 @@ class GroundOffset:
         if likelihoods is None:
             return
         self._likelihoods, self._views = _MEMORY * self._likelihoods + _INDEPENDENT * likelihoods, self._views + 1
-        # the first ones are averaged: there is no height to follow yet
+        # the first registrations are averaged: there is no height to follow yet
         self.metres += max(_FOLLOWED, 1.0 / self._views) * (self._weigh() - self.metres)
 
     def _weigh(self) -> float:
@@ -106,7 +106,7 @@ def log_likelihoods(cloud: RegistrationCloud, T_map_source: Pose, target: LocalM
         return None
     profile = _fits(ground, T_map_source, target).mean(axis=0)
     k = int(np.clip(profile.argmax(), 1, len(profile) - 2))
-    below, here, above = profile[k - 1 : k + 2]  # a parabola
+    below, here, above = profile[k - 1 : k + 2]  # vertex of a parabola
     bend = below - 2.0 * here + above
     between = 0.5 * (below - above) / bend if bend < 0.0 else 0.0
     level = float(_SHIFTS[k] + (_SHIFTS[1] - _SHIFTS[0]) * np.clip(between, -1.0, 1.0))
@@ -128,7 +128,7 @@ def structure_fits(cloud: RegistrationCloud, T_map_source: Pose, target: LocalMa
 
 
 def _patch_shares(structure: Points, fits: Floats) -> Floats:
-    """Mean fits (P, K) of the patches of structure (N, 3), which have fits (N, K)."""
+    """Mean fits (P, K) by patch of structure (N, 3) with fits (N, K)."""
     cell = np.floor(structure[:, :2] / _PATCH).astype(np.int64) @ np.array([1 << 20, 1])
     _, patch, count = np.unique(cell, return_inverse=True, return_counts=True)
     shares = np.stack([np.bincount(patch, column, len(count)) for column in fits.T], axis=1) / count[:, None]
@@ -136,14 +136,14 @@ def _patch_shares(structure: Points, fits: Floats) -> Floats:
 
 
 def _between(profiles: Floats, at: Reals) -> Floats:
-    """Interpolate profiles (P, K) over the shifts linearly at others (S,): (P, S)."""
+    """Interpolate profiles (P, K) over the shifts linearly at shifts (S,): (P, S)."""
     where = np.clip((at - _SHIFTS[0]) / (_SHIFTS[1] - _SHIFTS[0]), 0.0, len(_SHIFTS) - 1.001)
     k = where.astype(np.int64)
     return np.asarray(profiles[:, k] * (1.0 - where + k) + profiles[:, k + 1] * (where - k))
 
 
 def _fits(points: Points, T_map_source: Pose, target: LocalMap, shifts: Reals = _SHIFTS) -> Floats:
-    """Return the fit (N, K) in [0, 1] of points (N, 3) to the map at the shifts up and down."""
+    """Return the fit (N, K) in [0, 1] of points (N, 3) to the map at the vertical shifts (K,)."""
     moved = np.repeat(transform(T_map_source, points)[:, None], len(shifts), axis=1)
     moved[:, :, 2] += shifts
     flat = moved.reshape(-1, 3).astype(np.float32)
@@ -156,7 +156,7 @@ def _fits(points: Points, T_map_source: Pose, target: LocalMap, shifts: Reals = 
 
 
 def _some(points: Points) -> Points:
-    """Return at most ``_POINTS`` points, spread evenly over all in their order."""
+    """Return at most ``_POINTS`` points, evenly spread over all in their order."""
     return points[np.linspace(0, len(points) - 1, _POINTS).astype(np.int64)] if len(points) > _POINTS else points
 
 

@@ -10,19 +10,19 @@ import numpy as np
 from coview_stream.geometry.arrays import Floats
 from coview_stream.geometry.transforms import Pose, Poses, interpolate, inverse, log_so3, pose_from, rot_z
 
-_VELOCITY_OVER = 0.2  # seconds that a velocity is measured over; a robot that shakes does not turn
-_REMEMBERED = 10.0  # seconds of odometry; no queue of clouds is longer
+_VELOCITY_OVER = 0.2  # seconds over which a velocity is measured: the rotation of a shaking robot averages out
+_REMEMBERED = 10.0  # seconds of odometry, longer than any queue of clouds
 
 
 class Moment(NamedTuple):
     """Moment of a cloud."""
 
     stamp: float  # seconds
-    rates: Floats  # (3,) velocities x, y and rotation about z of the body, its axes; NaN where they are not known
+    rates: Floats  # (3,) velocities x, y and rotation about z of the body, its axes; NaN if unknown
 
 
 class OdometryHistory:
-    """Odometry of the last seconds, read at any moment: interpolated, and beyond its ends at constant velocities."""
+    """Odometry of the last seconds at any moment: interpolated, or extrapolated at constant velocity."""
 
     def __init__(self) -> None:
         self._stamps: list[float] = []
@@ -60,7 +60,7 @@ class OdometryHistory:
         if len(self._stamps) < 2:
             return np.full(3, np.nan)
         before, after = self._around(stamp)
-        if before > 0 and after < len(self._stamps) - 1:  # a mean over both sides
+        if before > 0 and after < len(self._stamps) - 1:  # average over both sides
             early = stamp - self._stamps[before] < self._stamps[after] - stamp
             before, after = (before - 1, after) if early else (before, after + 1)
         motion = inverse(self._poses[before]) @ self._poses[after]
@@ -69,9 +69,9 @@ class OdometryHistory:
         return np.append(middle[:2], turned) / (self._stamps[after] - self._stamps[before])
 
     def since_clouds(self, stamps: Floats, delay: float, scale: float) -> Poses:
-        """Return the body's motions (N, 4, 4) from the moments of late clouds to their stamps (N,), scaled.
+        """Return the body's scaled motions (N, 4, 4) from the moments of late clouds to their stamps (N,).
 
-        Where odometry is late instead (``delay`` below zero) the moments are the stamps.
+        Where odometry is the late one (``delay`` below zero) the moments are the stamps.
         """
         if delay <= 0.0 or len(self._stamps) < 2:
             return np.tile(np.eye(4), (len(stamps), 1, 1))
@@ -88,7 +88,7 @@ class OdometryHistory:
         return bool(self._stamps) and end <= self._stamps[-1]
 
     def all_at(self, stamps: Floats) -> Poses:
-        """Return the poses (N, 4, 4) at stamps (N,), interpolated, and beyond the ends extrapolated."""
+        """Return the poses (N, 4, 4) at stamps (N,), interpolated, or extrapolated beyond the ends."""
         known = np.array(self._stamps)
         after = np.clip(np.searchsorted(known, stamps), 1, len(known) - 1)
         low, high = after.min() - 1, after.max()
@@ -97,7 +97,7 @@ class OdometryHistory:
         return interpolate(poses[after - 1 - low], poses[after - low], share)
 
     def _beyond(self, stamp: float) -> Pose:
-        """Return the newest pose (4, 4), moved on to a later stamp on an arc."""
+        """Return the newest pose (4, 4), extrapolated to a later stamp along an arc."""
         begin = max(bisect_right(self._stamps, self._stamps[-1] - _VELOCITY_OVER) - 1, 0)
         motion = inverse(self._poses[begin]) @ self._poses[-1]
         times = (stamp - self._stamps[-1]) / (self._stamps[-1] - self._stamps[begin])

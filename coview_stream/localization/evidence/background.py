@@ -1,13 +1,13 @@
 """Background: shares of a scan that this map explains by chance, measured at wrong places.
 
-All scored places but those around the leader are chance places. Their mean shares are an observation's value at a wrong
-place, as much as 0.4 in a yard of equal boxes. Their scatter gives the number of independent observations in a scan:
-neighbouring points fall and rise together, and so do the scans of successive keyframes. A search has hundreds of wrong
+All scored places except those around the leader are chance places. Their mean shares are the expectation at a wrong
+place, up to 0.4 in a yard of equal boxes. Their scatter gives the number of independent observations in a scan:
+neighbouring points agree or disagree together, and so do scans of successive keyframes. A search has hundreds of wrong
 places; tracking has one place, so its background is measured in rings around it (:func:`observe_with_background`).
 
 Wrong places differ: among trees or houses any scan fits better than on a field. So a search also observes the map
-around each place, a few metres off and turned a little. Chance at a place is chance on this map, changed as much as the
-shares around the place differ from those around others, and the scatter is that about it.
+around each place, a few metres off and turned a little. Chance at a place is the map's chance, corrected by how the
+shares around the place differ from those around others, and the scatter is measured about it.
 """
 
 from __future__ import annotations
@@ -22,35 +22,35 @@ from coview_stream.geometry.distributions import normal_quantile
 from coview_stream.localization.evidence.observation import ObservedScan, ScanPart, Share
 
 # prior, set by hand
-_PSEUDO = 6.0  # chance places that it counts as
+_PSEUDO = 6.0  # weight of the prior in chance places
 _PSEUDO_SHARES = (0.12, 0.12, 0.16, 0.6)  # on, near, under edges, unexplained
 _PSEUDO_NUMBER = 3.0  # independent observations
-_MOST = 100.0  # independent observations of a scan: on a bare field chance places hardly scatter
+_MOST = 100.0  # most independent observations of a scan: on a bare field chance places hardly scatter
 _LEAST_DEVIATION = 0.03  # in units of one point's sigma: a thousand independent points
 _COVERED = 0.05  # least covered share of a scan by which other shares are divided
 _TAIL = (84.0, 95.0, 99.0)  # percentiles
-_MANY = 20  # places from which the second largest share is meaningful
+_MANY = 20  # least places for which the second largest share is meaningful
 _CALIBRATED = 1.75
-"""Factor on the number of independent observations by the scatter: searches on maps of other sites then state an error
-below e in less than a share e of them (``python -m bench.integrity.calibrate``)."""
+"""Factor on the number of independent observations by scatter. With it, of the searches on maps of other sites less
+than a share e state an error below e (``python -m bench.integrity.calibrate``)."""
 OPEN = 0.01
-"""Share of places that are as clear of structure and as level as the right one, presumed: open roads."""
+"""Presumed share of places as clear of structure and as level as the right one: open roads."""
 _RINGS, _SPOKES = (3.0, 5.0, 8.0, 12.0), 8  # metres from the pose, and places on each ring
-_TURNS = tuple(np.radians((-12.0, -4.0, 4.0, 12.0)))  # of the heading there, in turn
+_TURNS = tuple(np.radians((-12.0, -4.0, 4.0, 12.0)))  # of the heading at the places, alternating
 _PASSED = (0.003, 0.5)  # range of the share of free points that lie on structure
 NEARBY = slice(len(Share), len(Share) + 4)
-"""Columns of an observation (15,) of a search: shares of the structure's outcomes around the place."""
+"""Columns of a search's observation (15,): shares of the structure's outcomes around the place."""
 NEARBY_VARIANCE = slice(NEARBY.stop, NEARBY.stop + 4)
-"""Columns of an observation (15,) of a search: the variances of these shares among the poses around the place."""
+"""Columns of a search's observation (15,): variances of these shares among the poses around the place."""
 
 
 @dataclass(frozen=True)
 class Most:
-    """Upper limits of the number of independent observations."""
+    """Upper limits on the number of independent observations."""
 
     structure: float = np.inf  # patches of structure in a scan
     free: float = np.inf  # cubes of free space in a scan
-    scans: float = 1.0  # number of scans with different surroundings; 1 where all keyframes see the same
+    scans: float = 1.0  # scans with different surroundings; 1 where all keyframes see the same
 
 
 @dataclass(frozen=True)
@@ -60,13 +60,13 @@ class Background:
     Attributes:
         structure: (4,) probabilities that a covered structure point is on map structure, only near it, under an edge,
             unexplained.
-        around: (4,) the same around chance places; None where it was not observed.
+        around: (4,) the same around chance places; None if not observed.
         within: (4,) variances among the neighbours of one place, in units of one point's.
         between: (4,) variances of ``around`` from place to place.
         passed: probability that a free point lies on map structure.
-        ground: parameters of the Beta distribution, over places, of the ground's share on the map's ground.
+        ground: parameters of the Beta distribution, over places, of the share of the ground on the map's ground.
         number: effective numbers of independent structure points and of free points.
-        open: probability that a chance place is as clear and level as the right one; (Q, L) by the nuisances' values.
+        open: probability that a chance place is as clear and level as the right one; (Q, L) by nuisance values.
     """
 
     structure: Floats
@@ -79,13 +79,13 @@ class Background:
     between: Floats = field(default_factory=lambda: np.zeros(4))
 
     def structure_at(self, observed: Floats32) -> Floats:
-        """Return ``structure`` at places observed (P, 15): (P, 4), by the outcomes around each; else (1, 4)."""
+        """Return ``structure`` (P, 4) at places observed (P, 15), by the outcomes around each; (1, 4) without those."""
         return _structure_at(observed, self.structure, self.around)
 
     def relative_errors_at(self, observed: Floats32) -> Floats:
         """Return the relative standard errors (P, 4) of :meth:`structure_at`; (1, 4) zeros without ``around``.
 
-        Few poses around a place tell chance there, and none where they lie outside the survey.
+        Chance at a place is estimated from few poses, or from none if they lie outside the survey.
         """
         if self.around is None:
             return np.zeros((1, 4))
@@ -103,7 +103,7 @@ def outcomes(observed: Floats32) -> Floats:
 
 
 def observe_around(layers: kernels.FieldMap, part: ScanPart, poses: Floats) -> Floats32:
-    """Return the outcomes' mean shares (P, 8) at the neighbours of poses (P, 4), and their variances there."""
+    """Return the mean shares (P, 8) of the outcomes at the neighbours of poses (P, 4), and their variances."""
     nothing = part.points.structure[:0]
     structure = replace(part, points=replace(part.points, low=nothing, free=nothing))
     neighbours = (poses[:, None] + _NEIGHBOURS).reshape(-1, 4)
@@ -115,9 +115,9 @@ def observe_around(layers: kernels.FieldMap, part: ScanPart, poses: Floats) -> F
 def scatter(observed: Floats32) -> Floats:
     """Return the variances (4,) of chance places' shares (on, near, explained, passed), in units of one point's.
 
-    They belong to the narrowest normal distribution that covers the tail towards the shares of a right place, at one,
-    two and about three standard deviations and at the second largest share. The tail is often wider than the middle,
-    where a few places are of another kind than the rest.
+    They are those of the narrowest normal distribution that covers the tail towards the shares of a right place, at
+    one, two and about three standard deviations and at the second largest share. The tail is often wider than the
+    middle, where a few places are of another kind.
     """
     return _tail_variance(_deviations(observed))
 
@@ -125,8 +125,8 @@ def scatter(observed: Floats32) -> Floats:
 def left_in_mean(observed: Floats32) -> Floats:
     """Return ratios (4,) of the variance of the mean over keyframes to the mean variance (max of bulk and tail).
 
-    ``observed`` (N, W, 7 or 15) has W keyframes at the same chance places. Keyframes see much of the same surroundings,
-    so a place that fits by chance goes on to fit: at 1 all keyframes see the same.
+    ``observed`` (N, W, 7 or 15) has W keyframes at the same chance places. Keyframes share most of their surroundings,
+    so a place that fits by chance continues to fit: a ratio of 1 means that all keyframes see the same.
     """
     count, width = observed.shape[:2]
     if count < _MANY or width < 2:
@@ -146,7 +146,7 @@ def _tail_variance(shares: Floats) -> Floats:
     shares = np.sort(shares, axis=0)
     levels = np.percentile(shares, (50.0, *_TAIL), axis=0)
     reach = (levels[1:] - levels[0]) / np.array([normal_quantile(percent / 100.0) for percent in _TAIL])[:, None]
-    if count >= _MANY:  # the second largest, by Blom's plotting position; the largest may be a twin of the right place
+    if count >= _MANY:  # second largest, by Blom's plotting position; the largest may be a twin of the right place
         last = (shares[-2] - levels[0]) / normal_quantile((count - 1.375) / (count + 0.25))
         reach = np.vstack([reach, last])
     return np.asarray(np.maximum(reach.max(axis=0), _LEAST_DEVIATION) ** 2)
@@ -168,7 +168,7 @@ def _deviations(observed: Floats32) -> Floats:
 
 
 def _structure(observed: Floats32) -> tuple[Floats, Floats | None]:
-    """Return the structure's outcomes (4,) at chance places, and around them."""
+    """Return the outcomes (4,) of structure at chance places, and around them."""
     presumed = _PSEUDO * np.array(_PSEUDO_SHARES)
     chance = outcomes(observed).sum(axis=0) + presumed
     if observed.shape[1] == len(Share):
@@ -178,7 +178,7 @@ def _structure(observed: Floats32) -> tuple[Floats, Floats | None]:
 
 
 def _structure_at(observed: Floats32, chance: Floats, around: Floats | None) -> Floats:
-    """Return the structure's outcomes by chance at places observed (P, 15): (P, 4); (1, 4) without ``around``."""
+    """Return the outcomes (P, 4) of structure by chance at places observed (P, 15); (1, 4) without ``around``."""
     if around is None:
         return chance[None]
     nearby = len(_NEIGHBOURS) * observed[:, NEARBY].astype(np.float64) + around  # all places count as one neighbour
@@ -196,8 +196,8 @@ def estimate_background(now: Floats32, variance: Floats, followed: Floats32, mos
     Args:
         now: (N, 7 or 15) the newest keyframe's observations there.
         variance: (4,) mean of :func:`scatter` over the keyframes so far.
-        followed: (K, 7 or 15) mean observations over the keyframes at the followed ones.
-        most: limits of the number of independent observations.
+        followed: (K, 7 or 15) mean observations over the keyframes at the followed places.
+        most: limits on the number of independent observations.
     """
     most = most or Most()
     structure, around = _structure(now)
@@ -206,7 +206,7 @@ def estimate_background(now: Floats32, variance: Floats, followed: Floats32, mos
     number = _CALIBRATED * (count + _PSEUDO) / (count * measured + _PSEUDO / _PSEUDO_NUMBER)
     high = float(3.0 / (1.0 / number[:3]).sum())
     both = min(high, most.scans * min(_MOST, most.structure)), min(float(number[3]), most.scans * most.free)
-    # a Beta distribution by mean and variance of the ground's shares
+    # Beta distribution by the mean and variance of the ground's shares
     ground = np.concatenate([now, followed])
     shares = np.clip(ground[:, Share.GROUND] / np.maximum(ground[:, Share.COVERED_GROUND], _COVERED), 0.0, 1.0)
     shares = np.concatenate([shares, np.linspace(0.0, 1.0, round(_PSEUDO))])
@@ -243,4 +243,4 @@ def chance_places(pose: Floats) -> Floats:
 
 
 _NEIGHBOURS = chance_places(np.zeros(4))[: 2 * _SPOKES]
-"""Steps (16, 4) to the poses that tell chance at a place, 3 and 5 metres off."""
+"""Steps (16, 4) to the poses that measure chance at a place, 3 and 5 metres off."""

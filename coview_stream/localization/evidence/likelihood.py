@@ -1,16 +1,16 @@
 """Likelihood ratio of a place: "the robot is here" against chance, as explanations of the observations.
 
-At the right place the survey explains a share q of the structure, which is unchanged, and chance the rest. So an
-outcome has the probability
+At the right place the survey explains an unchanged share q of the structure, and chance the rest. So an outcome has the
+probability
 
     m = q d + (1 - q) b
 
-with b the background's probability and d the outcomes of unchanged structure in a survey of this kind. The sum is over
-three nuisances: q (the site may have changed), d (a survey from above shows roofs, one from the ground facades) and the
-share of rays that pass through structure (foliage). Most sites have changed little, so q has the density 2 q; the
-chance shares of edges and walls inform d. With n the effective number of observations of a kind and s the shares of
-their outcomes, the log-likelihood ratio is n sum(s log(m / b)): a place that explains no more than chance cannot gain,
-as q >= 0. Points outside the survey add nothing; a rival that covers them gains.
+with b its background probability and d its probability for unchanged structure in a survey of this kind. The sum is
+over three nuisance parameters: q (the site may have changed), d (a survey from above shows roofs, one from the ground
+facades) and the share of rays that pass through structure (foliage). Most sites have changed little, so q has the
+density 2 q; the chance shares of edges and walls inform d. With n the effective number of observations of a kind and s
+the shares of their outcomes, the log-likelihood ratio is n sum(s log(m / b)): a place that explains no more than chance
+cannot gain, as q >= 0. Points outside the survey add nothing; a rival that covers them gains.
 
 The ground counts as one observation, as a road is level everywhere: its share is compared with the Beta distribution of
 the chance places' shares. Some chance places are as clear and level as the right one
@@ -18,8 +18,8 @@ the chance places' shares. Some chance places are as clear and level as the righ
 
 The prior is even between "one of these places" and "none of these" (outside the map, a wrong map, a rearranged site),
 and falls with a place's rank in the votes. Likelihoods are against chance, so "none of these" has the likelihood 1.
-Chance gives a ratio of R or more with a probability of at most 1 / R (Markov's inequality), so N places give at most
-N / R equally good ones by chance, in expectation.
+Chance gives a ratio of R or more with probability 1 / R at most (Markov's inequality), so N places give at most N / R
+equally good ones by chance, in expectation.
 """
 
 from __future__ import annotations
@@ -43,10 +43,10 @@ _SURVEYS = np.array([
     [0.65, 0.25, 0.05, 0.05],
     [0.8, 0.17, 0.02, 0.01],
 ])  # fmt: skip
-"""Outcomes of unchanged structure, set by hand: on, near, under an edge, unexplained. The rows go from an airborne
+"""Outcomes of unchanged structure, set by hand: on, near, under an edge, unexplained. The rows range from an airborne
 survey (a closed canopy, then hedges and crowns with few returns, then streets) to a survey from the ground."""
 _EDGES = _SURVEYS[:, 2] / _SURVEYS[:, :3].sum(axis=1)  # share of the explained points below an edge
-_EDGES_WIDTH = 0.1  # excess of that share over chance's by which a survey's odds fall e-fold
+_EDGES_WIDTH = 0.1  # excess of that share over chance's that lowers a survey's odds e-fold
 _LEAKS = np.array([0.05, 0.3, 0.6])  # rays through unchanged structure, as a share of the background's
 _GROUND = (5.0, 1.5)  # Beta distribution of the share of the ground at the right place: grass and litter lower it
 _EDGE = 0.02  # shares of the ground are clipped to this margin
@@ -55,11 +55,11 @@ _NORMAL = np.linspace(-8.0, 8.0, 129)  # standard deviations
 _NORMAL_WEIGHTS = -0.5 * np.square(_NORMAL) - np.log(np.exp(-0.5 * np.square(_NORMAL)).sum())  # logarithms
 
 NUISANCES = (len(KEPT), len(_SURVEYS), len(_LEAKS))
-"""Shape (Q, D, L) of a table over the nuisances: unchanged share, kind of survey, leaks."""
+"""Shape (Q, D, L) of a table over the nuisance parameters: unchanged share, kind of survey, leaks."""
 
 
 def log_likelihood_ratios(observed: Floats32, background: Background) -> Floats:
-    """Return log-likelihood ratios (P,) of places against chance, summed over the nuisances.
+    """Return log-likelihood ratios (P,) of places against chance, summed over the nuisance parameters.
 
     Args:
         observed: (P, 7) mean observations at the places, see :class:`Share`; (P, 15) with the outcomes around them.
@@ -73,9 +73,9 @@ def log_likelihood_ratios(observed: Floats32, background: Background) -> Floats:
 
 
 def nuisance_prior(background: Background) -> Floats:
-    """Return the prior probabilities (Q, D, L) of the nuisances, which add up to one.
+    """Return the prior probabilities (Q, D, L) of the nuisance parameters, which add up to one.
 
-    Chance, too, puts a scan on walls where the survey shows walls, and below edges where it shows roofs. So surveys
+    Chance also puts a scan on walls where the survey shows walls, and below edges where it shows roofs. So surveys
     whose share below edges exceeds chance's are improbable.
     """
     chance = background.structure[2] / background.structure[:3].sum()
@@ -87,8 +87,8 @@ def nuisance_prior(background: Background) -> Floats:
 def ratio_variances(observed: Floats32, background: Background) -> Floats:
     """Return the variances (P,) of log-likelihood ratios by the standard errors of chance at each place.
 
-    They count as far as a place is explained by unchanged structure, at the most probable values of the nuisances.
-    Outcomes rise and fall together, with the density of the map, so their errors add up.
+    They count by the share that unchanged structure explains, at the most probable nuisance values. Outcomes vary
+    together, with the density of the map, so their errors add up.
     """
     counts = outcomes(observed)
     chance = background.structure_at(observed)[:, None, None]
@@ -102,14 +102,14 @@ def ratio_variances(observed: Floats32, background: Background) -> Floats:
 
 
 def log_likelihoods(observed: Floats32, background: Background) -> Floats:
-    """Return log-likelihood ratios (P, Q, D, L) of places against chance, by the values of the nuisances."""
+    """Return log-likelihood ratios (P, Q, D, L) of places against chance, by nuisance values."""
     counts = outcomes(observed)
     q = KEPT[:, None, None]
     chance = background.structure_at(observed)[:, None, None]
     explained = q * _SURVEYS + (1.0 - q) * chance  # (P, Q, D, 4)
     structure = np.einsum("pc,pqdc->pqd", counts, np.log(explained / chance)) * background.number[0]
     rest = clear_and_level(observed, background)
-    rest -= np.logaddexp(np.log1p(-background.open), np.log(background.open) + rest)  # a chance place may be open, too
+    rest -= np.logaddexp(np.log1p(-background.open), np.log(background.open) + rest)  # a chance place may also be open
     return np.asarray(structure[:, :, :, None] + rest[:, :, None, :])
 
 
@@ -126,7 +126,7 @@ def clear_and_level(observed: Floats32, background: Background) -> Floats:
     a, b = background.ground
     mean = np.full(1, min(max(a / (a + b), _EDGE), 1.0 - _EDGE))
     gain, usual = (_beta(x, *_GROUND) - _beta(x, a, b) for x in (share, mean))
-    # a place rougher than chance gets no more than one like chance, however rare it is
+    # a place rougher than chance gets no more than a place like chance, however rare it is
     level = np.clip(ground, 0.0, 1.0) * np.where(share < mean, np.minimum(gain, usual), gain)
     free += level[:, None, None]
     return np.asarray(free)
@@ -151,19 +151,19 @@ class Posterior:
 def posterior(ratios: Floats, votes: Ints, count: int, starts: int = 1, variances: Floats | None = None) -> Posterior:
     """Return the posterior of places.
 
-    It may be looked at after every keyframe: where every place is wrong the odds of all places together are a
-    martingale, so they ever exceed 1 / e with a probability of at most e (Ville's inequality). A search that starts
-    anew has another chance of an error; as the inverse squares add up, all starts together have less than 2 e.
+    It may be evaluated after every keyframe: where every place is wrong the odds of all places together are a
+    martingale, so they ever exceed 1 / e with probability e at most (Ville's inequality). Each restart of a search is
+    another chance of an error; as the inverse squares are summable, all starts together have less than 2 e.
 
     Args:
         ratios: (P,) log-likelihood ratios against chance.
         votes: (P,) ranks in the votes, from 0.
-        count: number N of scored places, these included: the others have the likelihood of chance.
-        starts: how often the search has started since a place was accepted.
+        count: number N of scored places, including these: the others have the likelihood of chance.
+        starts: number of starts of the search since a place was accepted.
         variances: (P,) of the ratios; none by default.
     """
     ranks = np.minimum(votes, max(count, 1) - 1)
-    # two recognizers rank places, and followed places keep their ranks: the sum may exceed that of one list
+    # two recognizers rank places, and followed places keep their ranks: their sum may exceed that of one list
     harmonic = float((1.0 / np.arange(1, max(count, 1) + 1)).sum())
     total = max(harmonic, float((1.0 / (1.0 + ranks)).sum()))
     logs = np.append(ratios - np.log1p(ranks) - np.log(total * starts**2), 0.0)
@@ -177,7 +177,7 @@ def posterior(ratios: Floats, votes: Ints, count: int, starts: int = 1, variance
 
 
 def _mean_gaps(gaps: Floats, sigmas: Floats) -> Floats:
-    """Return log-odds (N,) that are as probable, on the average, as uncertain ones: ``gaps`` with normal errors."""
+    """Return log-odds (N,) with the mean probability of uncertain ones: ``gaps`` with normal errors."""
     uncertain = gaps - sigmas * _NORMAL[:, None]
     wrong = np.logaddexp.reduce(_NORMAL_WEIGHTS[:, None] - np.logaddexp(0.0, uncertain), axis=0)
     return np.asarray(np.where(gaps > 0.0, np.log(-np.expm1(wrong)) - wrong, gaps))

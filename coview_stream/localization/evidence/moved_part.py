@@ -1,11 +1,11 @@
 """Evidence of a moved part: unexplained structure of a scan that fits some metres beside the place.
 
-Where a survey has buildings a few metres off, but trees, poles and hedges in place, the scan fits at two places and
+Where a survey shows buildings a few metres off, but trees, poles and hedges in place, the scan fits at two places and
 cannot decide between them. Objects replaced since the survey agree on a shift only by chance. So the unexplained
-structure is compared with the map at shifts all around the place, the best shift against the background of the others.
+structure is compared with the map at shifts around the place, the best shift against the background of the others.
 
-A patch of some metres fits by chance as a whole, with all points of a wall or along a hedge. So patches agree or not,
-and each has its own background. Map structure counts only where the scan has not explained it at the place already.
+A patch of some metres fits by chance as a whole, like all points of a wall or along a hedge. So patches agree or not,
+each against its own background. Map structure counts only where the scan has not already explained it at the place.
 """
 
 from __future__ import annotations
@@ -23,13 +23,13 @@ from coview_stream.localization.evidence.observation import ObservedScan
 
 # set by hand
 _PRIOR = 5e-4  # probability that a survey has a part of the site shifted as a whole
-_LEAST, _MOST = 2.0, 8.0  # metres, of shifts
+_LEAST, _MOST = 2.0, 8.0  # metres, range of the shifts
 _SAME = 2.5  # metres: nearer shifts explain the same points
 _PATCH = 3.0  # metres
-_TAKEN = 1.0  # metres from a point of the scan: map structure there is explained
-_MIN_POINTS, _MAX_POINTS = 10, 512  # unexplained; fewer agree on anything
+_TAKEN = 1.0  # metres from a point of the scan within which map structure is explained
+_MIN_POINTS, _MAX_POINTS = 10, 512  # of unexplained points; fewer agree on any shift
 _VOXEL = 0.25  # metres
-_AGREEING = np.linspace(0.05, 1.0, 20)  # shares of the patches that belong to the part, summed over
+_AGREEING = np.linspace(0.05, 1.0, 20)  # shares of patches that belong to the part, summed over
 _FITS = 0.9  # share of a patch's points that the map explains at the right shift
 _PSEUDO, _PSEUDO_SHARE = 2.0, 0.1  # prior of a patch's chance share: shifts, share
 _SHARES = (0.05, 0.9)  # range of a patch's chance share
@@ -55,7 +55,7 @@ def find_moved_part(field: kernels.FieldMap, scans: Sequence[ObservedScan], T_ma
         T_map_odom: (4, 4) the place, registered at the newest keyframe: its lean is the sensor's and turns with it.
     """
     place = scans[-1].poses(T_map_odom[None])[0]
-    place[3] = 0.0  # points are relative to the body and along the map's axes from here on
+    place[3] = 0.0  # from here on points are relative to the body, along the map's axes
     structure, unexplained = _structure(field, scans, T_map_odom, place)
     if len(unexplained) < _MIN_POINTS:
         return NO_PART
@@ -105,7 +105,7 @@ def _structure(
 
 
 def _explained(field: kernels.FieldMap, points: Points, structure: Points, shifts: Floats, place: Floats) -> Floats:
-    """Return 1 for points (N, 3) that lie near unexplained map structure at shifts (H, 2) of a place (4,), else 0.
+    """Return 1 for points (N, 3) near unexplained map structure at shifts (H, 2) of a place (4,), else 0.
 
     ``points`` and the scan's ``structure`` (M, 3) are relative to the place.
     """

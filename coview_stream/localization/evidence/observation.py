@@ -1,12 +1,12 @@
 """Observation of the map by a scan at a pose: shares of the scan's points that the likelihood field explains.
 
 A point above the ground is explained (map structure in its cell or within half a metre, or a roof edge above it, as a
-survey from above shows no walls), unexplained, or outside the survey. A point on the ground lies on the map's ground or
-off it, or outside the survey. A point that a ray passed through is free in the map, or contradicts it.
+survey from above shows no walls), unexplained, or outside the survey. A ground point lies on the map's ground, off it,
+or outside the survey. A point that a ray passed through is free in the map, or contradicts it.
 
-The likelihood compares the seven shares of :class:`Share`. :class:`Evidence` is their summary for people; causes of
-loss and the protection level follow from it. A right pose scores 0.3 to 0.95, a wrong one up to 0.7 on a uniform road:
-the score alone decides nothing (docs/integrity.md).
+The likelihood compares the seven shares of :class:`Share`. :class:`Evidence` summarizes them for people, the causes of
+a loss and the protection level. A right pose scores 0.3 to 0.95, a wrong one up to 0.7 on a uniform road: the score
+alone decides nothing (docs/integrity.md).
 """
 
 from __future__ import annotations
@@ -25,14 +25,14 @@ from coview_stream.geometry.arrays import Bools, Floats, Floats32, Ints
 from coview_stream.geometry.transforms import Points, Pose, norms
 from coview_stream.localization.registration.clouds import RegistrationCloud
 
-_FEW, _MANY = (256, 128, 192), (1024, 512, 768)  # structure, ground and free points that are looked up
-_PATCH = 4.0  # metres: neighbouring points are looked up in turn, as they lie in the same memory
+_FEW, _MANY = (256, 128, 192), (1024, 512, 768)  # looked-up structure, ground and free points
+_PATCH = 4.0  # metres; points are looked up patch by patch, as neighbours share memory
 _OFFSET = 1 << 15  # keeps patch numbers positive
 _MIN_STRUCTURE = 60  # points; fewer cannot distinguish places
-_PSEUDO = 20.0  # pseudo-observations at a share of 1/2: a handful of points is little evidence
+_PSEUDO = 20.0  # pseudo-observations with a share of 1/2, as a handful of points is little evidence
 
 # free space
-_RANGE = 35.0  # metres, beyond which a degree is wider than most objects
+_RANGE = 35.0  # metres; beyond, a degree is wider than most objects
 _MIN_RANGE = 1.0  # metres: nearer returns are the robot's own
 _MIN_HEIGHT = 0.8  # metres above the ground below the robot: kerbs and slopes graze the rays
 _BEAM = math.radians(2.0)  # cell of the range image
@@ -40,21 +40,21 @@ _COLUMNS = math.ceil(2.0 * math.pi / _BEAM) + 1  # one more than a turn, for rou
 _CELLS = _COLUMNS * (math.ceil(math.pi / _BEAM) + 1)
 _BEAM_HITS = 2  # least returns in a cell
 _MAX_RAYS = 32_768  # of a frame: a dense lidar has tens of them in each cell
-_SLACK, _SLACK_SLOPE = 0.5, 0.03  # metres, and metres per metre of range, that a ray has to end behind a point
+_SLACK, _SLACK_SLOPE = 0.5, 0.03  # metres, and metres per metre of range, by which a ray has to end behind a point
 _MARGIN = 0.35  # metres from the middle of a cell of the field to its border
-_FLOOR_RADIUS = 10.0  # metres around the sensor, of its ground
+_FLOOR_RADIUS = 10.0  # metres around the sensor in which its floor is measured
 _FLOOR_PERCENTILE = 5.0  # of the heights there: a few returns lie below the ground
 _MIN_FLOOR_POINTS = 20
-_SAMPLES = 6000  # points in the space around the robot
+_SAMPLES = 6000  # points sampled in the space around the robot
 _DEPTH = (-3.0, 9.0)  # metres, their heights relative to the sensor
-_LAYERS = 2  # cells that a surface fills along a ray
+_LAYERS = 2  # cells filled by a surface along a ray
 _VOXEL = 0.5  # metres between neighbouring points of a scan
 _POINTS_PASSED = np.pi * _RANGE**2 * (_DEPTH[1] - _DEPTH[0]) / _SAMPLES / (_LAYERS * 0.5) / _VOXEL**2
-"""Scan points on the surface that one passed sample stands for."""
+"""Scan points on the surface that one passed sample represents."""
 
 
 class Share(IntEnum):
-    """Columns of an observation: shares of the scan's points of a kind."""
+    """Columns of an observation: shares of a scan's points of one kind."""
 
     ON = 0
     """Structure points in a half-metre cell with map structure."""
@@ -69,19 +69,19 @@ class Share(IntEnum):
     COVERED_GROUND = 5
     """Ground points in the surveyed area."""
     PASSED = 6
-    """Points passed by rays that are map structure."""
+    """Free points, passed by rays, that are map structure."""
 
 
 @dataclass(frozen=True)
 class Evidence:
-    """Shares in [0, 1] of a scan that a pose explains; a wrong place fails each in another way.
+    """Shares in [0, 1] of a scan that a pose explains; wrong places fail in different ones.
 
     Attributes:
         near: structure (> 1 m above the ground) within half a metre of map structure; 0 for fewer than 60 points.
         covered: structure that is near, or below a roof edge of the map.
         ground: ground points on the map's ground.
         free_space: map structure in sight of the robot that its rays met rather than passed through.
-        inside: points in the surveyed area; the other shares leave out the rest.
+        inside: points in the surveyed area; the other shares ignore the rest.
     """
 
     near: float
@@ -98,7 +98,7 @@ class Evidence:
 
 @dataclass(frozen=True)
 class Observations:
-    """Observations of the map at H poses."""
+    """Observations of the map from H poses."""
 
     poses: Floats  # (H, 4) x, y, z of the body in the map, metres, and heading of the odometry frame, radians
     shares: Floats32  # (H, 7), columns as in Share
@@ -111,7 +111,7 @@ class Observations:
         return np.asarray(np.sqrt(near * covered * ground * free_space), dtype=np.float32)
 
     def evidence(self, row: int) -> Evidence:
-        """Return the evidence for one of the poses."""
+        """Return the evidence at one of the poses."""
         return Evidence(*self.parts[row].tolist())
 
 
@@ -121,8 +121,8 @@ class ScanPart:
 
     Attributes:
         points: of each kind, relative to the body, axes of the odometry frame, metres.
-        weights: how many of the scan's structure, ground and free points each sampled one stands for.
-        level: share of the scan's ground that may be held against the survey's: the rest was dug or filled since.
+        weights: number of the scan's structure, ground and free points per sampled one.
+        level: share of the scan's ground that is compared with the survey's: the rest was dug or filled since.
     """
 
     points: kernels.FieldScan
@@ -140,7 +140,7 @@ class ScanPart:
         return cls(kernels.FieldScan(*samples), (structure, low, free), level)
 
     def look_up(self, field: kernels.FieldMap, poses: Floats, move: Move) -> Observations:
-        """Observe the map from poses (H, 4), as in :class:`Observations`, each moved as far as ``move`` allows first.
+        """Observe the map from poses (H, 4), as in :class:`Observations`, each first moved as far as ``move`` allows.
 
         ``Move.NEAR`` allows odometry's drift between keyframes.
         """
@@ -210,16 +210,16 @@ class ObservedScan:
         return np.asarray(self.T_odom_body[:3, 3])
 
     def evidence(self, field: kernels.FieldMap, T_map_odom: Pose) -> Evidence:
-        """Return the evidence for a pose (4, 4), without its tilt against gravity."""
+        """Return the evidence at a pose (4, 4), without its tilt against gravity."""
         return self.many.look_up(field, self.poses(T_map_odom[None]), Move.NONE).evidence(0)
 
     def poses(self, T_map_odom: Floats) -> Floats:
-        """Return the poses (H, 4), as in :class:`Observations`, at which level transforms (H, 4, 4) put the scan."""
+        """Return the poses (H, 4), as in :class:`Observations`, of the scan under level transforms (H, 4, 4)."""
         turned = T_map_odom[:, :3, :3] @ self.body + T_map_odom[:, :3, 3]
         return np.column_stack([turned, np.arctan2(T_map_odom[:, 1, 0], T_map_odom[:, 0, 0])])
 
     def transforms(self, poses: Floats) -> Floats:
-        """Return the level ``T_map_odom`` (H, 4, 4) that put the scan at poses (H, 4)."""
+        """Return the level ``T_map_odom`` (H, 4, 4) of the scan at poses (H, 4)."""
         T = np.tile(np.eye(4), (len(poses), 1, 1))
         cos, sin = np.cos(poses[:, 3]), np.sin(poses[:, 3])
         T[:, 0, 0], T[:, 0, 1], T[:, 1, 0], T[:, 1, 1] = cos, -sin, sin, cos
@@ -262,7 +262,7 @@ class RangeImage:
     def passed_points(self, dug: float = 0.0) -> Floats:
         """Return points (F, 3), body frame, metres, that the frame's rays passed through well above the ground.
 
-        The ground that was there before lay ``dug`` metres higher.
+        The surveyed ground lay ``dug`` metres higher.
         """
         points, ranges, cells = _samples()
         beyond = ranges + _MARGIN
@@ -271,7 +271,7 @@ class RangeImage:
 
 
 def _filled(points: Points | Floats) -> Ints:
-    """Return the distinct identifiers of the patches, or cubes, around points (N, 2) or (N, 3)."""
+    """Return the distinct identifiers of the patches, or cubes, that contain points (N, 2) or (N, 3)."""
     cell = np.floor(points * (1.0 / _PATCH)).astype(np.int64) + _OFFSET
     return np.unique(cell @ (1 << np.arange(0, 16 * points.shape[1], 16)))
 
@@ -282,7 +282,7 @@ def _by_patch(points: Points) -> Ints:
 
 
 def _directions(points: Points | Floats, ranges: Floats32 | Floats) -> Ints:
-    """Return the cell (N,) of each point (N, 3), body frame: rows upwards, leftwards from straight behind."""
+    """Return the cell (N,) of each point (N, 3), body frame: rows upwards, columns leftwards from straight behind."""
     turn = ((np.arctan2(points[:, 1], points[:, 0]) + np.pi) / _BEAM).astype(np.int64)
     rise = ((np.arcsin(np.clip(points[:, 2] / ranges, -1.0, 1.0)) + 0.5 * np.pi) / _BEAM).astype(np.int64)
     return np.asarray(rise * _COLUMNS + turn)
@@ -290,7 +290,7 @@ def _directions(points: Points | Floats, ranges: Floats32 | Floats) -> Ints:
 
 @lru_cache(maxsize=1)
 def _samples() -> tuple[Floats, Floats, Ints]:
-    """Return points (N, 3), evenly in the space around the sensor, their ranges and cells of direction."""
+    """Return points (N, 3) spread evenly over the space around the sensor, their ranges and cells of direction."""
     rng = np.random.default_rng(20240)
     radius, turn = _RANGE * np.sqrt(rng.random(_SAMPLES)), 2.0 * np.pi * rng.random(_SAMPLES)
     height = rng.uniform(*_DEPTH, _SAMPLES)

@@ -1,11 +1,11 @@
-"""Share of a map's places that are as clear of structure and as level as the right one: open roads, car parks, fields.
+"""Share of a map's places as clear of structure and as level as the right one: open roads, car parks, fields.
 
-Ground and free space of a scan agree with the map at the right place, and at every open place. How rare open places are
-decides how much that agreement is worth (:mod:`coview_stream.localization.evidence.likelihood`): next to nothing on a
-plain, as much as ten nats in hills. They are counted twice, and the larger share holds: among the places that the
-search scores, hundreds that votes have named, and among poses at stations all over the map, thousands at each keyframe,
-chosen at random. A place has to stay open over the whole drive: poses that are open so far are followed from keyframe
-to keyframe, and new ones are looked up at the earlier keyframes as well.
+Ground and free space of a scan agree with the map at the right place and at every open place. The rarity of open places
+determines the value of that agreement (:mod:`coview_stream.localization.evidence.likelihood`): next to nothing on a
+plain, up to ten nats in hills. They are counted twice, and the larger share holds: among the places that the search
+scores, hundreds that votes have named, and among poses at random stations of the map, thousands at each keyframe. A
+place has to stay open over the whole drive: poses that are open so far are followed from keyframe to keyframe, and new
+ones are also looked up at the earlier keyframes.
 """
 
 from __future__ import annotations
@@ -21,24 +21,24 @@ from coview_stream.localization.evidence.background import OPEN, Background
 from coview_stream.localization.evidence.likelihood import NUISANCES, clear_and_level
 from coview_stream.localization.evidence.observation import ObservedScan, ScanPart, Share
 
-_STATIONS = 4096  # that a keyframe is observed from
-_FOLLOWED = 96  # drives that go on, and new ones that are looked up back in time: their count is known to a tenth
-_PRESUMED = 1.0 / OPEN  # places that the presumed share counts as: one of them is open
+_STATIONS = 4096  # from which a keyframe is observed
+_FOLLOWED = 96  # drives that continue, and new ones looked up at earlier keyframes: gives their count to a tenth
+_PRESUMED = 1.0 / OPEN  # weight of the presumed share in places: one of them is open
 _STEPS = 5  # of expectation and maximization
-_EVERY = 8  # one of so many structure points is looked up
+_EVERY = 8  # every 8th structure point is looked up
 _BLOCK = 512  # places at a time: intermediate arrays stay in the cache
 _SEED = 20240
 SIGHT = 35.0
-"""Metres from the leader within which places have its ground and its free space in common."""
+"""Metres from the leader within which places share its ground and its free space."""
 
 
 @dataclass(frozen=True)
 class _Drives:
-    """Drives from stations at random headings, as odometry has them.
+    """Drives from stations at random headings, with odometry's motion.
 
     Attributes:
         poses: (S, 4) at the newest keyframe.
-        weights: (S,) how many drives each stands for.
+        weights: (S,) number of drives that each represents.
         observed: (S, W, 7) observations at the keyframes, oldest first.
     """
 
@@ -57,7 +57,7 @@ class _Drives:
         return _Drives(*both)
 
     def sampled(self, probable: Floats, random: np.random.Generator) -> _Drives:
-        """Return :data:`_FOLLOWED` drives at most, drawn by their probability (S,) to be open, that stand for all."""
+        """Return at most :data:`_FOLLOWED` drives, drawn by probability (S,) to be open, weighted to represent all."""
         chances = self.weights * probable
         step = chances.sum() / _FOLLOWED
         if len(chances) <= _FOLLOWED or not step > 0.0:
@@ -87,7 +87,7 @@ class OpenPlaces:
     ) -> None:  # fmt: skip
         """Observe a map's ``field`` from drives to random ``stations`` (M, 3), ``height`` metres above them.
 
-        Drives of the earlier keyframes ``scans``, oldest first, go on to the newest ``scan``.
+        Drives of the earlier keyframes ``scans``, oldest first, continue to the newest ``scan``.
         """
         part = _ground(scan)
         if len(scans) and len(self._drives.poses):
@@ -99,7 +99,7 @@ class OpenPlaces:
         count = _STATIONS if len(stations) else 0
         chosen = self._random.integers(max(len(stations), 1), size=count)
         heading = self._random.uniform(-np.pi, np.pi, count)
-        order = np.argsort(chosen, kind="stable")  # neighbours are looked up in turn: they lie in the same memory
+        order = np.argsort(chosen, kind="stable")  # looks up neighbours in turn, as they share memory
         at = stations[chosen[order]].astype(np.float64)
         poses = np.column_stack([at[:, :2], at[:, 2] + height, heading[order]])
         observed = part.look_up(field, poses, kernels.Move.NEAR)
@@ -111,28 +111,28 @@ class OpenPlaces:
         return None
 
     def add(self, observed: Floats32, poses: Floats) -> None:
-        """Add drives at random: their observations (S, W, 7) at all keyframes, and poses (S, 4) at the newest."""
+        """Add random drives: their observations (S, W, 7) at all keyframes, and poses (S, 4) at the newest."""
         self._drives = self._drives + _Drives(poses, np.ones(len(poses)), observed)
         self._at, self._count = poses[:, :2], self._count + len(poses)
 
     def forget(self, keyframe: int) -> None:
-        """Drop the observations of a keyframe, by its number from 0, the oldest."""
+        """Drop the observations of a keyframe, by its number from the oldest, 0."""
         rest = np.arange(self._drives.observed.shape[1]) != keyframe
         self._drives = replace(self._drives, observed=self._drives.observed[:, rest])
 
     def share(self, chance: Floats32, background: Background, leader: Floats | None = None) -> Floats:
-        """Return the probability (Q, L) that a chance place is open, by the nuisances.
+        """Return the probability (Q, L) that a chance place is open, by nuisance values.
 
         Args:
             chance: (P, 7) observations at scored places more than :data:`SIGHT` from the leader.
             background: of the other shares.
-            leader: x, y, ... of the leader: stations as near are left out as well.
+            leader: x, y, ... of the leader; stations within :data:`SIGHT` of it are ignored as well.
         """
         self._look_back(background)
         weights, count = self._drives.weights.astype(np.float32), float(self._count)
         if leader is not None and count:
             weights *= np.linalg.norm(self._drives.poses[:, :2] - leader[:2], axis=1) > SIGHT
-            # drives of earlier keyframes end all over the map as the newest do; more may end far from the leader
+            # drives of earlier keyframes end all over the map like the newest; more of them may end far from the leader
             count *= float((np.linalg.norm(self._at - leader[:2], axis=1) > SIGHT).mean())
         scored = _odds_against(chance, background)
         anywhere = _odds_against(self._drives.observed.mean(axis=1), background)
@@ -146,7 +146,7 @@ class OpenPlaces:
         return np.maximum(rate, named).astype(np.float64)
 
     def _look_back(self, background: Background) -> None:
-        """Look up the earlier keyframes at the newest drives, those that may be open by the newest keyframe."""
+        """Look up the earlier keyframes along the newest drives that may be open by the newest keyframe."""
         if self._newest is None:
             return
         newest, scans, scan, field = self._newest
@@ -162,13 +162,13 @@ class OpenPlaces:
 
 
 def _ground(scan: ObservedScan) -> ScanPart:
-    """Return the few points of a scan, with one of eight of structure, which only moves it, as at scored places."""
+    """Return the few points of a scan, with every 8th structure point, which only move it as at scored places."""
     points = scan.few.points
     return replace(scan.few, points=replace(points, structure=points.structure[::_EVERY]))
 
 
 def _odds_against(observed: Floats32, background: Background) -> Floats32:
-    """Return likelihood ratios (P, Q, L) of places that are not open to open ones, for these observations (P, 7)."""
+    """Return the likelihood ratios (P, Q, L), not open to open, of places with observations (P, 7)."""
     out = np.empty((len(observed), NUISANCES[0], NUISANCES[2]), dtype=np.float32)
     for start in range(0, len(out), _BLOCK):
         part = slice(start, start + _BLOCK)

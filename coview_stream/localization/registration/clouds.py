@@ -1,4 +1,4 @@
-"""The two clouds of a registration: the robot's recent points, thinned, and a crop of the map around a place."""
+"""The two clouds of a registration: the robot's thinned recent points, and a crop of the map around a place."""
 
 from __future__ import annotations
 
@@ -26,11 +26,11 @@ if TYPE_CHECKING:
 
 
 _CELL = 2.0  # metres: the ground hardly rises within it, and walls are seldom wider
-_CLEAR = 0.5  # metres above the lowest point nearby, of points that are not ground
+_CLEAR = 0.5  # metres above the lowest point nearby; higher points are not ground
 _FLOOR_PERCENTILE = 1.0  # of the heights: a few returns lie below the ground
 STRUCTURE_HEIGHT = 1.0  # metres above the lowest ground nearby
 _TILT, _VIEWED = math.radians(0.35), 0.12  # radians, metres: sigmas of a registration without ground
-_SEED = 20240  # of the choice among too many points
+_SEED = 20240  # of the random subset of points
 
 
 @dataclass(frozen=True)
@@ -38,11 +38,11 @@ class RegistrationCloud:
     """A local scan to register."""
 
     points: Points  # (N, 3) float32, gravity-aligned frame, metres
-    above: Bools  # (N,) whether a point stands above the ground or lies on it
+    above: Bools  # (N,) whether a point stands above the ground
     height: Floats32  # (N,) metres above the lowest ground nearby
-    ground_offset: float = 0.0  # metres by which the points on the ground have been lowered
-    changed: float = 0.0  # share of the ground that was left out, as it does not lie on the survey's
-    dug: float = 0.0  # metres that the survey's ground lies above that ground, at most
+    ground_offset: float = 0.0  # metres by which the ground points have been lowered
+    changed: float = 0.0  # share of the ground that was left out, as it differs from the survey's
+    dug: float = 0.0  # largest height of the survey's ground above that ground, metres
 
     @property
     def high(self) -> Bools:
@@ -58,13 +58,13 @@ class RegistrationCloud:
     def doubted(self, covariance: Floats) -> Floats:
         """Return a registration's covariance (6, 6) over (rx, ry, rz, x, y, z), wider where the ground has changed.
 
-        Structure alone, seen from below now and from above before, leaves tilt and height to its own errors.
+        Without ground, tilt and height have the errors of structure, seen from below now and from above before.
         """
         return np.asarray(covariance + self.groundless * np.diag([_TILT**2, _TILT**2, 0.0, 0.0, 0.0, _VIEWED**2]))
 
     @property
     def groundless(self) -> float:
-        """Probability that no ground holds height and tilt: three patches do, and all three have changed."""
+        """Probability that no ground constrains height and tilt: three patches do, and all three have changed."""
         return self.changed**3
 
     def every(self, nth: int) -> RegistrationCloud:
@@ -91,7 +91,7 @@ def prepare_scan(points: Points, position: Floats, config: RegistrationConfig) -
     if len(thin) > config.source_points:
         chosen = np.random.default_rng(_SEED).choice(len(thin), config.source_points, replace=False)
         chosen.sort()
-    # by place: neighbours are compared with the same part of the map, which is in the cache then
+    # sort by cell: neighbours are compared with the same part of the map, which is then cached
     chosen = chosen[np.argsort(cell[chosen], kind="stable")]
     thin, height = thin[chosen], height[chosen]
     return RegistrationCloud(thin, height > _CLEAR, height)
@@ -100,7 +100,7 @@ def prepare_scan(points: Points, position: Floats, config: RegistrationConfig) -
 def thinned(points: Points, position: Floats, config: RegistrationConfig) -> Points:
     """Return the points (K, 3) of a local scan in range, one per voxel: the first step of :func:`prepare_scan`.
 
-    Arguments are those of :func:`prepare_scan`, which has the same result for these points as for all.
+    :func:`prepare_scan`, whose arguments these are, has the same result for these points as for all.
     """
     return kernels.transform_unique(points, np.eye(4), config.source_voxel, 0.0, config.source_range, position)[0]
 
@@ -123,7 +123,7 @@ def _heights(points: Points) -> tuple[Floats32, Ints]:
     rows, columns = int(i.max()) + 1, int(j.max()) + 1
     cell = i * columns + j
     lowest = np.full(rows * columns, np.inf, dtype=np.float32)
-    np.minimum.at(lowest, cell, np.ascontiguousarray(points[:, 2]))  # quick on flat arrays only
+    np.minimum.at(lowest, cell, np.ascontiguousarray(points[:, 2]))  # fast on contiguous arrays only
     around = min_filter(lowest.reshape(rows, columns), 3)
     return points[:, 2] - around.ravel()[cell], cell
 
@@ -134,16 +134,16 @@ def voxelized(cloud: Points, T_odom_body: Pose, config: KeyframeConfig) -> Point
 
 
 MAX_CROP_BYTES = 32_000_000
-"""Bytes of crops that are cached beside those in use: three of a dense survey, at 10 MB."""
+"""Bytes of cached crops beside those in use: three crops of a dense survey, at 10 MB."""
 _CROP_STEP = 16.0  # metres between the centres of cached crops
 
 
 @dataclass(frozen=True, eq=False)
 class LocalMap:
-    """A crop of the base map; its search structures are made at first use."""
+    """A crop of the base map; its search structures are built at first use."""
 
     points: Points  # (K, 3) map frame, metres
-    normals: Points  # (K, 3) normals, as long as the planarity around each point: 1 on a surface, 0 in scatter
+    normals: Points  # (K, 3) normals, with the planarity around each point as length: 1 on a surface, 0 in scatter
     cells: Cells | None = None  # the points' order by cell, if they have been sorted
 
     @cached_property
@@ -154,7 +154,7 @@ class LocalMap:
         return kernels.PointGrid.sorted(self.points, self.cells)
 
     def planes(self, rows: Ints) -> tuple[Floats32, Floats32]:
-        """Return the unit normals (N, 3) of points by their rows, and the planarity (N,) around each in [0, 1]."""
+        """Return the unit normals (N, 3) of points by row, and the planarity (N,) in [0, 1] around each."""
         normals = self.normals[rows]
         length = norms(normals)
         unit = np.asarray(normals / np.maximum(length, np.float32(1e-6))[:, None], dtype=np.float32)
@@ -167,20 +167,20 @@ class LocalMap:
         return order + self.normals.nbytes  # sorted points are a view of the rows
 
     def prepare(self) -> None:
-        """Sort the points now."""
+        """Build the search structures now."""
         if "grid" not in vars(self):
             kernels.nearest(self.grid, self.points[:1], 1.0)
 
 
 class LocalMaps:
-    """Crops of a base map by place; those in use and the recently used ones are cached."""
+    """Crops of a base map by place; those in use and recently used are cached."""
 
     def __init__(self, base_map: BaseMap, radius: float, max_bytes: int = MAX_CROP_BYTES) -> None:
         self._map = base_map
         self._radius = radius
         self._max_bytes = max_bytes
         self._crops: WeakValueDictionary[tuple[int, int], LocalMap] = WeakValueDictionary()
-        self._recent: OrderedDict[LocalMap, None] = OrderedDict()  # the last one is the newest
+        self._recent: OrderedDict[LocalMap, None] = OrderedDict()  # newest last
         self._empty: set[tuple[int, int]] = set()  # places without a crop
 
     def around(self, position: Floats) -> LocalMap | None:

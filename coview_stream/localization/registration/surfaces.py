@@ -1,4 +1,4 @@
-"""Surfaces of single clouds, and the registration of one cloud to another's surfaces: a motion without the map."""
+"""Flat surfaces of single clouds, and registration of one cloud to another's surfaces: a motion without the map."""
 
 from __future__ import annotations
 
@@ -15,23 +15,23 @@ from coview_stream.localization.registration.clouds import LocalMap, Registratio
 from coview_stream.localization.registration.register import register
 
 LONGEST = 12.0
-"""Metres between two clouds that still show the same."""
+"""Metres between two clouds that still share their surroundings."""
 _SCALES = (1.5, 0.8, 0.4)  # metres: largest correspondence distances of the registration, coarse to fine
-_FARTHER = 3.0  # metres, of a start that nothing is known about
+_FARTHER = 3.0  # metres, first scale from a start without a prior
 _FREE = np.array([math.radians(2.0), math.radians(2.0), math.radians(3.0), 0.05, 0.05, 0.05])
-_FREE_METRE = 0.1  # prior sigmas of the motion about its start: constant, and metres per metre of it
+_FREE_METRE = 0.1  # prior sigmas of the motion about its start: constant, and metres per metre of motion
 
 # sigmas of a registered motion
 _POSITION = 0.02  # metres
-_POSITION_METRE = 0.01  # and per metre: as in three real runs at two to eight metres a step
+_POSITION_METRE = 0.01  # per metre: as in three real runs at steps of two to eight metres
 _ANGLE = math.radians(0.2)
 
 # surface patches
 _CELL = 1.0  # metres
 _CELL_POINTS = 5
 _THICKNESS = 0.15  # metres, one sigma across
-_FLATTER = 2.0  # times as wide as thick
-_RANGE_NOISE = 0.03  # metres: points along one ring are a line, which noise alone makes wider than it is thick
+_FLATTER = 2.0  # least ratio of width to thickness
+_RANGE_NOISE = 0.03  # metres: points along one ring form a line, whose width is mere noise
 
 
 def motion_prior(T_start: Pose, far: float) -> kernels.Prior:
@@ -50,7 +50,7 @@ def register_to_cloud(
 ) -> Registration | None:
     """Register a scan to the surfaces of an earlier one from a prior's mean, or from any pose (4, 4).
 
-    The motion turns about ``centre`` (3,).
+    Rotations are about ``centre`` (3,).
     """
     if isinstance(start, kernels.Prior):
         return register(scan, start.T_map_source, target, config, _SCALES, start, centre)
@@ -58,7 +58,7 @@ def register_to_cloud(
 
 
 def surface_points(points: Points) -> tuple[Points, Floats32]:
-    """Return the points (K, 3) of a cloud (N, 3) in cubic metres with a flat surface, and their normals (K, 3)."""
+    """Return the points (K, 3) of a cloud (N, 3) that are in a flat cubic metre, and their normals (K, 3)."""
     if not len(points):
         return points, points.copy()
     cell = np.floor(points / np.float32(_CELL)).astype(np.int64)
