@@ -173,7 +173,7 @@ class Calibration:
 
     @property
     def extrapolation(self) -> Floats:
-        """(6, 6) covariance over (rx, ry, rz, x, y, z) of extrapolating late odometry, which lacks recent accelerations."""
+        """(6, 6) covariance over (rx, ry, rz, x, y, z) of extrapolated late odometry, without recent accelerations."""
         grown = 0.5 * min(self.delay, 0.0) ** 2
         moved = (grown * _ACCELERATION) ** 2
         return np.diag([0.0, 0.0, (grown * _TURN_ACCELERATION) ** 2, moved, moved, 0.0])

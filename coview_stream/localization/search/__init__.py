@@ -1,1 +1,1 @@
-"""Global search: votes of keyframes, hypotheses, and when to believe one."""
+"""Global search: votes of keyframes, hypotheses, and the acceptance of a place."""

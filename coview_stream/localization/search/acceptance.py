@@ -25,12 +25,12 @@ IN_CIRCLE = " (searched in the circle given)"
 """End of a reason for no pose where only a circle was searched."""
 
 
-MAX_PLACES = 20  # as many as a screen shows clearly; the message stays below 3 kB
+MAX_PLACES = 20  # a screen shows them clearly, and the message stays below 3 kB
 
 
 @dataclass(frozen=True)
 class Considered:
-    """The most probable places of a robot at a keyframe, for people to look at; nothing is decided by them.
+    """The most probable places of a robot at a keyframe, for display only.
 
     Attributes:
         stamp: of the keyframe, seconds.
@@ -45,7 +45,7 @@ class Considered:
 
     @classmethod
     def of(cls, scored: Scored, request: SearchRequest, origin: Floats) -> Considered | None:
-        """Sum up a keyframe's places on a map of ``origin`` (3,); None without any place."""
+        """Return a keyframe's places on a map with ``origin`` (3,); None without any place."""
         rows = []
         for place in sorted(scored.places, key=lambda place: -place.probability)[:MAX_PLACES]:
             T_map_body = place.T_map_odom @ request.T_odom_body
@@ -62,12 +62,12 @@ class SearchResult:
         evidence: of the most probable place, with the resulting state and the reason.
         travelled: metres that odometry had driven at the keyframe.
         epoch: of the request.
-        rivals: all places that the keyframe was scored at.
-        leader: (4, 4) T_map_odom of the most probable place, registered if that succeeded, level by the newest frame
+        rivals: all scored places of the keyframe.
+        leader: (4, 4) T_map_odom of the most probable place, registered if that succeeded, levelled by the newest frame
             alone; None without any place.
         T_odom_body: (4, 4) of the keyframe.
-        calibration: has levelled the keyframe's clouds.
-        considered: the most probable places, for people to look at; None without any place.
+        calibration: that levelled the keyframe's clouds.
+        considered: the most probable places, for display; None without any place.
     """
 
     accepted: Hypothesis | None
@@ -89,14 +89,10 @@ class SearchResult:
 def decide(
     scored: Scored, leader: Hypothesis | None, request: SearchRequest, rule: AcceptanceConfig, undecided: float = 0.0
 ) -> SearchResult:
-    """Judge a keyframe.
+    """Decide on a keyframe's places by ``rule``, the integrity risk.
 
-    Args:
-        scored: the places.
-        leader: the most probable place, registered; None if that failed.
-        request: of the keyframe.
-        rule: the integrity risk.
-        undecided: metres between equally probable poses of the first place; 0 if one of them stands out.
+    ``leader`` is the most probable place, registered; None if that failed. ``undecided`` is the distance in metres
+    between equally probable poses of the first place; 0 if one of them stands out.
     """
     state, reason = _verdict(scored, leader, rule, undecided)
     if request.area is not None and state is not State.TRACKING:
@@ -128,11 +124,11 @@ def _verdict(scored: Scored, leader: Hypothesis | None, rule: AcceptanceConfig, 
         if leader is None:
             return State.AMBIGUOUS, "the place that stands out does not register"
         if all(place.station is None for place in scored.places):
-            return State.AMBIGUOUS, "no vote has named a place to compare it with"  # a hint is not trusted
+            return State.AMBIGUOUS, "no vote has named a place to compare it with"  # hints are not trusted
         if undecided:
             return State.AMBIGUOUS, f"the place is found, but poses {undecided:.1f} m apart fit there equally"
         return State.TRACKING, f"found: wrong {one_in(scored.error)}"
-    if scored.moved.probability > scored.error:  # it is the larger part of the error
+    if scored.moved.probability > scored.error:  # most of the error
         metres = f"{scored.moved.metres:.0f} m"
         wrong = f"wrong {one_in(scored.error)}, {one_in(rule.risk)} needed"
         return State.AMBIGUOUS, f"a part of what is seen may fit {metres} beside the rest: {wrong}"

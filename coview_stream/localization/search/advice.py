@@ -1,7 +1,7 @@
-"""Advice to an ambiguous robot: the way to where the places that fit differ most, from the map alone.
+"""Advice to an ambiguous robot: the path to where the fitting places differ most, from the map alone.
 
-From the most probable place virtual scans of the map (:func:`virtual_scan`) are taken along the ways that have ground,
-and looked up at the other places that fit, as if the robot had driven on there. The advice goes with the reason.
+From the most probable place, virtual scans of the map (:func:`virtual_scan`) are taken along the paths with ground and
+compared with the map at the other fitting places, as if the robot had driven there. The advice is added to the reason.
 """
 
 from __future__ import annotations
@@ -24,14 +24,14 @@ from coview_stream.localization.search.scoring import BASIN_ANGLE, BASIN_DISTANC
 from coview_stream.localization.state import State
 
 _SIDES = ("ahead", "to the left", "back", "to the right")  # of the body, counter-clockwise
-_METRES = (5, 15, 30)  # driven: each costs a virtual scan
-_STEP = 2.0  # metres, of a way that has a station at each step
-_AGAIN = 10.0  # metres of driving until the map is asked again
-_SERIOUS, _MOST = 0.01, 5  # least probability of a place that fits beside the first one's, and the number of them
+_METRES = (5, 15, 30)  # driven; each costs a virtual scan
+_STEP = 2.0  # metres; a path has a station at each step
+_AGAIN = 10.0  # metres of driving until new advice
+_SERIOUS, _MOST = 0.01, 5  # least probability of another place relative to the first one's, and the number of places
 
 
 class AdvisedSearch(GlobalSearch):
-    """Search whose result says, where several places fit, which way they differ.
+    """Search whose result, if several places fit, advises where they differ.
 
     Attributes:
         considered: places of the newest keyframe, None without any.
@@ -41,8 +41,8 @@ class AdvisedSearch(GlobalSearch):
         """As :class:`GlobalSearch`."""
         super().__init__(*args, **options)
         self.considered: Considered | None = None
-        self._goal: Floats | None = None  # (3,) odometry frame; None if no way is better than to stay
-        self._asked: tuple[Epoch, float] | None = None  # metres driven when the map was asked
+        self._goal: Floats | None = None  # (3,) odometry frame; None if no path is better than staying
+        self._asked: tuple[Epoch, float] | None = None  # epoch and metres driven at the newest advice
 
     def update(self, request: SearchRequest) -> SearchResult:
         """Search the map for one keyframe; the reason of an ambiguous one ends with the advice."""
@@ -62,7 +62,7 @@ class AdvisedSearch(GlobalSearch):
         return replace(result, evidence=evidence)
 
     def _best_way(self, places: list[Pose]) -> Floats | None:
-        """Return the goal (3,) in the body frame from which the places (map <- body) differ most; None for here."""
+        """Return the goal (3,) in the body frame at which the places (map <- body) differ most; None for here."""
         best, goal = self._difference(places, places[0][:3, 3]), None
         for away, there in self._ways(places[0]):
             difference = self._difference(places, there)
@@ -71,7 +71,7 @@ class AdvisedSearch(GlobalSearch):
         return goal
 
     def _ways(self, T_map_body: Pose) -> Iterator[tuple[Floats, Floats]]:
-        """Yield goals, nearest first: in the body frame, and on the map's ground; a way ends where no station is."""
+        """Yield goals, nearest first: in the body frame, and on the map's ground; a path ends where no station is."""
         heading = np.arange(len(_SIDES)) * (2.0 * np.pi / len(_SIDES))
         along = np.column_stack([np.cos(heading), np.sin(heading), np.zeros(len(_SIDES))])
         at, grid = np.tile(T_map_body[:3, 3], (len(_SIDES), 1)), self.base_map.station_grid
@@ -87,7 +87,7 @@ class AdvisedSearch(GlobalSearch):
                 yield driven * along[side], at[side].copy()
 
     def _difference(self, places: list[Pose], there: Floats) -> float:
-        """Return by how much less the likest other place explains of the view that the first one has from ``there``."""
+        """Return by how much less the most similar other place explains of the first one's view from ``there``."""
         station = int(self.base_map.station_grid.at(there[None])[0])
         eye = there.copy() if station < 0 else np.array([*there[:2], self.base_map.stations[station, 2]])
         eye[2] += EYE
@@ -101,7 +101,7 @@ class AdvisedSearch(GlobalSearch):
 
 
 def serious(places: Floats) -> list[Pose]:
-    """Return map <- body of the first of :class:`Considered` places (K, 6) and of those elsewhere that may be right."""
+    """Return map <- body of the first :class:`Considered` place (K, 6) and of distinct places that may be right."""
     x, y, z, yaw, probability, _ = places.T
     turn = np.abs((yaw - yaw[0] + np.pi) % (2.0 * np.pi) - np.pi)
     apart = (np.linalg.norm(places[:, :3] - places[0, :3], axis=1) > BASIN_DISTANCE) | (turn > BASIN_ANGLE)

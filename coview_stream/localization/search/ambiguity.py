@@ -1,8 +1,8 @@
-"""Ambiguity of a map: the distance that a robot has to drive from its stations before it is localized.
+"""Ambiguity of a map: the distance that a robot has to drive from its stations until it is localized.
 
 At a station, a virtual scan of the map (:func:`virtual_scan`), with a share of the site changed since the survey, is
-searched for with a search's evidence: among the places by the votes of the station's descriptors, and places around it.
-While the error exceeds the risk, the robot drives on along the longest open way and adds keyframes.
+searched for with a search's evidence: among the places voted for by the station's descriptors, and places around it.
+While the error exceeds the risk, the robot drives along the longest open path and adds keyframes.
 """
 
 from __future__ import annotations
@@ -28,16 +28,16 @@ from coview_stream.localization.search.retrieval import Retrieval, StationConsen
 from coview_stream.localization.search.scoring import AROUND, PlaceScorer, Scored
 
 STATIONS = 1000  # at most; a twentieth of a second each
-_DRIVES = 100  # simulated drives from stations that are ambiguous at once; the rest copy their nearest neighbour
+_DRIVES = 100  # simulated drives from stations that are not localized at once; the rest copy their nearest neighbour
 _CHANGED = 0.3  # share of the site that has changed since the survey
 _KEYFRAMES = (2.0, 4.0, 6.0, 8.0, 10.0, 13.0, 16.0, 20.0, 25.0, 30.0, 35.0, 40.0)  # metres driven
 FARTHEST = _KEYFRAMES[-1]
-"""Metres that a robot drives at most."""
+"""Maximum driving distance in metres."""
 _RIGHT_DISTANCE, _RIGHT_ANGLE = 2.0, np.radians(15.0)  # metres, radians: the place itself
 _HEADINGS = 16  # directions of a drive
-_SHARPEST = np.radians(100.0)  # turn between two straights
-_STEP = 1.0  # metres: a way is open if all steps have a station
-_SHORTEST = 3  # steps of a way
+_SHARPEST = np.radians(100.0)  # largest turn between two straights
+_STEP = 1.0  # metres; a path is open if all steps have a station
+_SHORTEST = 3  # least steps of a path
 _TALL, _HALF_WIDTH = 2.0, 0.8  # metres: height of obstacles, half width of the robot
 _STOREY = 2.5  # metres
 _KEPT_SCANS = 8
@@ -45,13 +45,13 @@ _KEPT_SCANS = 8
 # of a virtual scan
 _RANGE = 40.0  # metres
 _NEAREST = 1.0  # metres
-_BEAM = np.radians(1.0)  # cell of the range image that hides what lies behind
+_BEAM = np.radians(1.0)  # cell of the range image that models occlusion
 _UP, _DOWN = 22, 22  # cells above and below the horizon: the field of view of common lidars
 _COLUMNS = 360  # cells around
-_HOLES = ((7.0, 5), (16.0, 3))  # metres up to which a surface of quarter-metre voxels has gaps so many cells wide
-_SLACK, _SLACK_SLOPE = 0.4, 0.03  # metres, plus so many per metre of range, behind the nearest: still in view
+_HOLES = ((7.0, 5), (16.0, 3))  # up to these metres, surfaces of quarter-metre voxels have gaps of so many cells
+_SLACK, _SLACK_SLOPE = 0.4, 0.03  # metres, and metres per metre of range, still visible behind the nearest point
 _NOISE = 0.03  # metres
-_CHANGE_PATCH = 4.0  # metres: edge of a patch that changes as one
+_CHANGE_PATCH = 4.0  # metres, edge of a patch that changes as a whole
 _MOVED = (3.0, 6.0)  # metres of its shift
 _TABLE = 64  # patches until the random draws repeat
 
@@ -63,7 +63,7 @@ class Ambiguity:
     Attributes:
         station: (K,) indices of the stations.
         position: (K, 3) their positions, metres, relative to the map's origin.
-        drive: (K,) metres; 0 at once, infinite if not within 40 m or to the end of the way.
+        drive: (K,) metres; 0 at once, infinite if not within 40 m or before the path ends.
         driven: (K,) whether ``drive`` was simulated there; otherwise it is the nearest simulated station's.
         evidence: (K,) log-likelihood ratio of the place against chance at the first keyframe, nats.
         lead: (K,) its difference to the best place elsewhere, nats.
@@ -89,7 +89,7 @@ class Ambiguity:
         return len(self.station)
 
     def share(self, metres: float) -> float:
-        """Return the share of the stations from which the robot is localized within so many metres."""
+        """Return the share of the stations from which the robot is localized within ``metres``."""
         return float((self.drive <= metres).mean()) if len(self) else 0.0
 
 
@@ -102,12 +102,8 @@ def ambiguity(
 ) -> Ambiguity:
     """Measure a map's ambiguity at no more than ``count`` of its stations, evenly spread.
 
-    Args:
-        base_map: the map.
-        config: of the search; its risk decides.
-        count: of the stations.
-        changed: share of the site that has changed since the survey, in [0, 1].
-        progress: called with the numbers of finished stations and of all.
+    The risk in ``config`` decides. ``changed`` is the share of the site in [0, 1] that has changed since the survey.
+    ``progress`` is called with the numbers of finished stations and of all.
 
     Raises:
         MapError: the map's likelihood field cannot be used.
@@ -139,7 +135,7 @@ def sample(base_map: BaseMap, count: int) -> Indices:
     block = cell = base_map.config.block
     stations -= stations.min(axis=0) - 0.5 * cell
     levels = int(np.unique(_numbers(stations[:, :2], (block, block)), return_counts=True)[1].max(initial=1))
-    while len(stations) > count * levels * (cell / block + 2.0) ** 2:  # more cells even if all of them are full
+    while len(stations) > count * levels * (cell / block + 2.0) ** 2:  # more than ``count`` cells even if all are full
         cell *= 1.05
     while True:
         number = _numbers(stations, (cell, cell, max(cell, _STOREY)))
@@ -151,7 +147,7 @@ def sample(base_map: BaseMap, count: int) -> Indices:
 
 
 def _numbers(positions: Floats, cell: tuple[float, ...]) -> Ints:
-    """Return the number (N,) of the cell of positions (N, D) that are not below zero."""
+    """Return the cell number (N,) of non-negative positions (N, D)."""
     index = np.floor(positions / cell).astype(np.int64)
     return np.asarray(np.ravel_multi_index(tuple(index.T), tuple(index.max(axis=0, initial=0) + 1)))
 
@@ -165,7 +161,7 @@ def _counted(items: Indices, progress: Progress | None) -> Iterator[int]:
 
 @dataclass(frozen=True)
 class _Seen:
-    """Result of a search at a station, with the numbers of :class:`Ambiguity`."""
+    """Result of a search at a station, with numbers as in :class:`Ambiguity`."""
 
     found: bool
     wrong: bool
@@ -175,7 +171,7 @@ class _Seen:
 
 
 class _Rehearsal:
-    """Search without a robot: keyframes at stations, from the map's points."""
+    """Search without a robot: its keyframes are virtual scans of the map at stations."""
 
     def __init__(self, base_map: BaseMap, config: LocalizerConfig, changed: float) -> None:
         self.base_map = base_map
@@ -196,7 +192,7 @@ class _Rehearsal:
         return self._look(self.base_map.stations[station].astype(np.float64), station)
 
     def drive(self, station: int) -> tuple[float, bool]:
-        """Drive on from a station; return the metres until it is localized, and whether another place was accepted."""
+        """Drive from a station; return the metres until it is localized, and whether another place was accepted."""
         if self.begin(station).wrong:
             return np.inf, True
         for metres, place in self._way(self.base_map.stations[station].astype(np.float64)):
@@ -233,7 +229,7 @@ class _Rehearsal:
         return self._scans[key]
 
     def _way(self, place: Floats) -> Iterator[tuple[float, Floats]]:
-        """Yield the following keyframes: metres driven and places (3,) on the ground."""
+        """Yield the next keyframes: metres driven and places (3,) on the ground."""
         driven, heading = 0.0, None
         due = deque(_KEYFRAMES)
         while due:
@@ -246,7 +242,7 @@ class _Rehearsal:
             driven, place = driven + len(places) * _STEP, places[-1]
 
     def _straight(self, place: Floats, before: float | None, metres: float) -> tuple[Floats, float]:
-        """Return the longest straight way (N, 3) from a place, in steps of a metre, and its heading."""
+        """Return the longest straight path (N, 3) from a place, in steps of a metre, and its heading."""
         scan = self._scan(place)
         high = np.empty((0, 3)) if scan is None else scan.cloud.points[scan.cloud.above] - place
         obstacle = high[high[:, 2] < _TALL, :2]
@@ -298,16 +294,10 @@ def _is_right(place: Hypothesis, body: Floats) -> bool:
 
 
 def virtual_scan(base_map: BaseMap, eye: Floats, changed: float, config: RegistrationConfig) -> ObservedScan | None:
-    """Return a sensor's scan of a map at ``eye`` (3,), odometry frame = map frame; None if it is empty.
+    """Return a virtual scan of a map at ``eye`` (3,), with odometry frame = map frame; None if it is empty.
 
-    It holds the map's points within 40 m that are not hidden, in cells of a degree, 22 degrees up and down. A share of
-    the site has changed: the points of so many 4 m patches, the same in all scans, are shifted by 3 to 6 m.
-
-    Args:
-        base_map: the map.
-        eye: position, map frame, metres.
-        changed: share of the patches, in [0, 1].
-        config: how scans are thinned.
+    It has the map's visible points within 40 m, in cells of a degree, 22 degrees up and down. In a share ``changed`` of
+    all 4 m patches, the same in all scans, points are shifted by 3 to 6 m. ``config`` sets the thinning.
     """
     near = base_map.points_near(eye, _RANGE + _MOVED[1])
     visible = _in_view(_rearranged(near, changed) - eye.astype(np.float32))
@@ -320,7 +310,7 @@ def virtual_scan(base_map: BaseMap, eye: Floats, changed: float, config: Registr
 
 
 def _rearranged(points: Points, changed: float) -> Points:
-    """Shift the points of the changed patches, the same in all scans."""
+    """Shift the points of the changed patches."""
     if changed <= 0.0:
         return points
     x, y = (np.floor(axis * np.float32(1.0 / _CHANGE_PATCH)).astype(np.int32) % _TABLE for axis in points[:, :2].T)
@@ -331,7 +321,7 @@ def _rearranged(points: Points, changed: float) -> Points:
 
 @lru_cache(maxsize=1)
 def _shifts(changed: float) -> Floats32:
-    """Return random shifts (P, 2), metres, of a share of the patches; 0 of the others."""
+    """Return random shifts (P, 2), metres, for a share of the patches; 0 for the others."""
     rng = np.random.default_rng(20240)
     draw, turn = rng.random(_TABLE**2), rng.uniform(0.0, 2.0 * np.pi, _TABLE**2)
     distance = rng.uniform(*_MOVED, _TABLE**2)
@@ -357,7 +347,7 @@ def _in_view(points: Points) -> Points:
 
 
 def _without_holes(nearest: Floats32) -> Floats32:
-    """Close gaps in near surfaces, so that they hide the points behind them."""
+    """Close gaps in near surfaces, so that these hide the points behind them."""
     out = nearest
     for reach, window in _HOLES:
         near = np.where(nearest < reach, nearest, np.float32(np.inf))

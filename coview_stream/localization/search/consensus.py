@@ -2,7 +2,7 @@
 
 A keyframe names stations and shifts where it may have been taken; each pair is a hypothesis of the same unknown
 transform. Odometry predicts the station and shift of the other keyframes under it, and their votes there are added. A
-place that one keyframe names is scored by all keyframes; other places are never scored.
+place named by one keyframe is scored by all keyframes; other places are never scored.
 """
 
 from __future__ import annotations
@@ -23,8 +23,8 @@ from coview_stream.geometry.arrays import Floats, Floats32, Indices, Ints
 from coview_stream.geometry.transforms import Pose
 from coview_stream.localization.evidence.observation import Evidence
 
-_KEPT = 8  # places per requested hypothesis that stay from keyframe to keyframe
-_BIN, _BIN_YAW = 2.0 / 3.0, 0.5  # size of bins, relative to the distances that make places distinct
+_KEPT = 8  # places per requested hypothesis that are kept between keyframes
+_BIN, _BIN_YAW = 2.0 / 3.0, 0.5  # bin sizes relative to the distances that make places distinct
 
 
 @dataclass(frozen=True)
@@ -32,17 +32,17 @@ class Hypothesis:
     """A hypothesis of ``T_map_odom``, from the votes that name it to its registration.
 
     Attributes:
-        T_map_odom: (4, 4); the registered pose once there is a registration.
+        T_map_odom: (4, 4); after registration the registered pose.
         station: index of the station; None for a pose hint, which has no votes.
         shift: number of sectors; None for a pose hint.
         votes: sum of the votes, lower is better.
         learned: whether learned features voted.
-        hinted: whether a pose hint came to this place.
+        hinted: whether a pose hint led to this place.
         score: of the newest keyframe, in [0, 1], by the field.
         ratio: log-likelihood ratio of the keyframes so far against chance.
         probability: posterior probability that the robot is here.
         registration: of the newest keyframe.
-        evidence: for the registered pose.
+        evidence: at the registered pose.
     """
 
     T_map_odom: Pose
@@ -58,7 +58,7 @@ class Hypothesis:
     evidence: Evidence | None = None
 
     def after(self, T_other_odom: Pose) -> Hypothesis:
-        """Return the hypothesis of the odometry frame, from one of another (4, 4) that it has been turned into."""
+        """Return the hypothesis for the odometry frame, given another frame (4, 4) into which that was turned."""
         T = self.T_map_odom @ T_other_odom
         registration = None if self.registration is None else self.registration._replace(T_map_source=T)
         return replace(self, T_map_odom=T, registration=registration)
@@ -82,7 +82,7 @@ class Vote(Protocol):
         ...
 
     def at(self, stations: Ints, shifts: Ints) -> Floats32:
-        """Return z-scores (K,) of stations at shifts, negative is better; 0 for station -1, none."""
+        """Return z-scores (K,) of stations at shifts, lower is better; 0 for station -1, none."""
         ...
 
     def at_all(self, requests: Sequence[tuple[Self, Ints, Ints]]) -> list[Floats32]:
@@ -132,7 +132,7 @@ class Consensus:
         self.clear()
 
     def __len__(self) -> int:
-        """Return how many keyframes have voted."""
+        """Return the number of keyframes that have voted."""
         return len(self._votes)
 
     def clear(self) -> None:
@@ -192,7 +192,7 @@ class Consensus:
         return np.asarray(places.offset + turned[places.shift])
 
     def _moved(self, places: _Places, vote: Vote) -> _Places:
-        """Return known places at the stations of a new keyframe; their height follows the stations'."""
+        """Return the known places at the stations of a new keyframe, at the height of these stations."""
         position = self._positions(places, vote)
         station = self.grid.at(position)
         on_map = station >= 0
@@ -200,7 +200,7 @@ class Consensus:
         return _Places(places.shift, places.offset, station, places.votes)
 
     def _named(self, vote: Vote) -> _Places:
-        """Return the places that a keyframe names, without votes (eq. 12, corrected: the yaw turns about it)."""
+        """Return the places that a keyframe names, without votes (eq. 12, corrected: the yaw is about the keyframe)."""
         station, shift = vote.candidates()
         votes = np.zeros((len(station), self.config.window), dtype=np.float32)
         places = _Places(shift, np.zeros((len(station), 3)), station, votes)

@@ -1,4 +1,4 @@
-"""Global search: hypotheses from a keyframe, their scores, and the decision whether to accept one."""
+"""Global search: hypotheses from a keyframe, their scores, and the decision to accept one."""
 
 from __future__ import annotations
 
@@ -25,21 +25,21 @@ from coview_stream.localization.search.request import EarlierKeyframe, Epoch, Re
 from coview_stream.localization.search.scoring import BASIN_ANGLE, BASIN_DISTANCE, PlaceScorer, Scored
 
 _ORDINARY = 20_000  # stations up to which the configured number of co-view hypotheses is enough
-_GUESSES = 12  # poses of a guess that are tried at a keyframe
-_STREET = 12.0  # metres from the leader: the farthest hypothesis beside it, moved as far as it may be
+_GUESSES = 12  # poses of a guess tried per keyframe
+_STREET = 12.0  # metres from the leader: reach of the farthest hypothesis around it after its largest move
 
 
 @dataclass(frozen=True)
 class Reading:
-    """A reading of a keyframe, level or leaning, and the places by it.
+    """A reading of a keyframe, level or leaning, and its places.
 
     Attributes:
-        request: the keyframe, turned about the body.
-        scan: of it.
+        request: the keyframe, rotated about the body.
+        scan: of the keyframe.
         scored: the places.
-        leader: the first one, registered; None if that failed.
-        level: (4, 4) the leader's ``T_map_odom``, level by the newest frame alone; None without a leader.
-        turn: (4, 4) turned odometry frame <- odometry frame.
+        leader: the first place, registered; None if that failed.
+        level: (4, 4) the leader's ``T_map_odom``, levelled by the newest frame alone; None without a leader.
+        turn: (4, 4) rotated odometry frame <- odometry frame.
     """
 
     request: SearchRequest
@@ -51,16 +51,16 @@ class Reading:
 
     @property
     def leans(self) -> bool:
-        """Whether it is a leaning one: earlier scans are not levelled like its own."""
+        """Whether it is leaning: earlier scans are not levelled like its own."""
         return not np.array_equal(self.turn, np.eye(4))
 
 
 class GlobalSearch:
-    """Search of the whole map, a keyframe at a time (paper, eqs 1-13); docs/method.md follows its steps.
+    """Search of the whole map, one keyframe at a time (paper, eqs 1-13); docs/method.md follows its steps.
 
     Attributes:
-        coview: the recognizer by the paper's descriptors; None if it is not used.
-        learned: the recognizer by learned features; None if it is not used.
+        coview: recognizer by the paper's descriptors; None if unused.
+        learned: recognizer by learned features; None if unused.
     """
 
     KERNELS = (
@@ -110,7 +110,7 @@ class GlobalSearch:
         return {} if self.coview is None else self.coview.last_query
 
     def prepare(self) -> None:
-        """Do the work that the first update would wait for.
+        """Load and compute ahead of the first update.
 
         Raises:
             InputError: the network of the learned features cannot be loaded.
@@ -128,13 +128,13 @@ class GlobalSearch:
         self._keyframes = 0
 
     def reset(self) -> None:
-        """Forget the newest descriptors as well."""
+        """Forget all votes and observations, and the newest descriptors."""
         self.clear()
         if self.coview is not None:
             self.coview.last_query = {}
 
     def update(self, request: SearchRequest) -> SearchResult:
-        """Search the map for one keyframe; another epoch or an acceptance begins a new search."""
+        """Search the map for one keyframe; another epoch or an acceptance starts a new search."""
         if request.epoch != self._epoch:
             self._begin(request)
         self._scorer.area = request.area
@@ -157,7 +157,7 @@ class GlobalSearch:
         return replace(result, considered=Considered.of(reading.scored, request, self.base_map.origin))
 
     def _decide(self, reading: Reading) -> SearchResult:
-        """Decide about a keyframe's first place by its rivals along the street, its modes, and parts that moved."""
+        """Decide on a keyframe's first place by its rivals along the street, its modes, and moved parts."""
         request, scan, scored, leader = reading.request, reading.scan, reading.scored, reading.leader
         undecided = 0.0
         if leader is not None:
@@ -166,7 +166,7 @@ class GlobalSearch:
                 place = scored.places[0]
                 modes = find_modes(place, leader, scan, request, self.base_map, self.config, self._local_maps)
                 leader, undecided = modes.best, modes.undecided
-            if scored.error < 0.5:  # a stated error that is not acted on has to be true as well
+            if scored.error < 0.5:  # a stated error has to be true even if nothing follows from it
                 scans = [scan] if reading.leans else [*self._scorer.scans[:-1], scan]
                 scored = scored.doubted(find_moved_part(self.base_map.field, scans, leader.T_map_odom))
         result = decide(scored, leader, request, self.config.acceptance, undecided)
@@ -183,11 +183,11 @@ class GlobalSearch:
         return levelled_by_frame(leader.T_map_odom, request, self.config.registration, self._local_maps)
 
     def _leaning(self, upright: Reading, hypotheses: list[Hypothesis], ranks: list[int], hints: int) -> Reading | None:
-        """Read the scan as one of a sensor that leans as the leader has it; None where that tells nothing else.
+        """Return the reading of the scan by the leader's lean; None if that has no other result.
 
-        A sensor leans alike at all places: all are scored anew by this keyframe alone, among chance places of the same
-        lean. The lean was chosen to fit, so its reading counts by its prior probability, and a later keyframe's as
-        another start.
+        A sensor leans alike at all places: all are scored again by this keyframe alone, among chance places of the same
+        lean. As the lean was fitted, the reading counts with the lean's prior probability, and that of a later keyframe
+        as another start.
         """
         request, leader, seen = upright.request, upright.leader, upright.level
         if leader is None or seen is None:
@@ -213,7 +213,7 @@ class GlobalSearch:
         return Reading(turned, scan, scored.together_with(upright.scored), found, level, turn)
 
     def _begin(self, request: SearchRequest) -> None:
-        """Begin anew with a request, or go on with its earlier keyframes: then it is no other start."""
+        """Restart with a request, or continue with its earlier keyframes, which is no other start."""
         starts = self._scorer.starts + (bool(self._scorer.scans) and not request.earlier)
         keyframes = self._keyframes if request.earlier else 0
         self.clear()
@@ -236,9 +236,9 @@ class GlobalSearch:
         return [place for place, _ in ranked], [rank for _, rank in ranked]
 
     def _guessed(self, request: SearchRequest) -> list[Hypothesis]:
-        """Return the best few poses of a guess, on the ground, each time that they are due.
+        """Return the best few poses of a guess, on the ground, whenever they are due.
 
-        All poses around one place would be taken for the chance places of this map.
+        With all of its poses around one place, these would count as chance places of the map.
         """
         due = self._guesses.due(request.guesses)
         if not due:
@@ -254,7 +254,7 @@ class GlobalSearch:
         return [guesses[k] for k in np.argsort(-scores, kind="stable")[:_GUESSES]]
 
     def _register(self, scored: Scored, scan: ObservedScan, request: SearchRequest) -> Hypothesis | None:
-        """Register the most probable place; None if that leads to another place or leans."""
+        """Register the most probable place; None if the result is another place or leans."""
         if not scored.places:
             return None
         best = scored.places[0]
@@ -264,9 +264,9 @@ class GlobalSearch:
         return leader
 
     def _gathered(self, scored: Scored, leader: Hypothesis, scan: ObservedScan, request: SearchRequest) -> Scored:
-        """Count rivals along the leader's street as the leader where registration leads them there.
+        """Count rivals along the leader's street as the leader where registration takes them there.
 
-        The field tells poses a few metres along a street hardly apart; points against surfaces do. Only where that may
+        The field hardly separates poses a few metres along a street; points against surfaces do. Done only where it may
         lead to an acceptance.
         """
 
@@ -291,19 +291,19 @@ class GlobalSearch:
         return replace(scored, error=max(error, scored.none))
 
     def _note_hints(self, scored: Scored, hints: list[Hypothesis], request: SearchRequest) -> None:
-        """Note whether the keyframe spoke against the hints that it tried."""
+        """Record whether the keyframe refuted the hints that it tried."""
         if not hints:
             return
         best = max((place.ratio for place in scored.places if place.hinted), default=-math.inf)
         positions = [robot_position(hint.T_map_odom, request.T_odom_body) for hint in hints]
-        # where the map knows nothing, a keyframe does not speak against a hint
+        # outside the survey a keyframe does not refute a hint
         surveyed = all(self.base_map.surveyed(position).all() for position in positions)
         self._hints.tried(refuted=surveyed and best < 0.0)
 
 
 def coview_peaks(configured: int, stations: int) -> int:
-    """Return the number of co-view hypotheses on a map of so many stations.
+    """Return the number of co-view hypotheses on a map with so many ``stations``.
 
-    On an airborne map of 324,000 stations the right place came 70th to 250th, by exhaustive sums too.
+    On an airborne map of 324,000 stations the right place came 70th to 250th, even by exhaustive sums.
     """
     return round(configured * math.sqrt(math.sqrt(max(1.0, stations / _ORDINARY))))

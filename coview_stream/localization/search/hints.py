@@ -1,6 +1,6 @@
-"""Hints and guesses of the robot's place: more hypotheses for the search, and none is trusted.
+"""Hints and guesses of the robot's place: further hypotheses for the search, none of them trusted.
 
-Only the circle of a guess is trusted: nothing outside of it is searched.
+Only the circle of a guess is trusted: nothing outside is searched.
 """
 
 from __future__ import annotations
@@ -25,21 +25,21 @@ _SPACING = 3.0  # metres
 _TURN = np.radians(13.0)
 _MAX_POSES = 400
 
-_TRIES = 5  # keyframes in a row that must refute all hints before they are tried less often
-_PAUSE = 4  # keyframes between two tries then
-_GROWTH = 1.25  # of a circle's radius from step to step and at first, so that no step is within a quarter of it
+_TRIES = 5  # successive keyframes that must refute all hints before these are tried less often
+_PAUSE = 4  # keyframes between two later tries
+_GROWTH = 1.25  # factor on a circle's radius, at first and per step: no new step within a quarter of it
 
 MAX_DISTANCE = 20.0
-"""Metres around a guess that are tried at most."""
+"""Maximum distance around a guess that is tried, metres."""
 
 MIN_WITHIN = 50.0
-"""Metres, least radius of a circle that is searched alone: evidence is judged against the other places in it.
+"""Metres, smallest radius of a circle to search alone: evidence is judged against the other places in it.
 
-The radius of a virtual scan; no robot came to a pose in one that it was not in (``python -m bench city``).
+This is the radius of a virtual scan; no robot got a pose in a circle that it was not in (``python -m bench city``).
 """
 
 FROM_THERE = " (from the last known place)"
-"""End of an evidence's reason where the best hypothesis began as a hint."""
+"""End of an evidence's reason where the best hypothesis was a hint at first."""
 
 
 @dataclass(frozen=True)
@@ -48,13 +48,13 @@ class PlaceGuess:
 
     Attributes:
         x, y: in the frame of the map's sources, metres.
-        yaw: heading of the body's x axis, radians, counter-clockwise from the map's x axis; None: any.
-        distance: metres around it that are tried as well, up to :data:`MAX_DISTANCE`.
-        angle: radians to either side of ``yaw`` that are tried as well.
-        map: name of the one of several maps in whose frame it is; None or ``map`` of one map.
-        within: metres around it outside of which nothing is searched; None: all of the map is. Unlike the rest this
-            is trusted: of a robot that is elsewhere no place is found.
-        begin, end: of x, beyond which ``within`` does not reach: where one of several maps ends.
+        yaw: heading of the body's x axis, radians, counter-clockwise from the map's x axis; None for any.
+        distance: metres around it that are also tried, up to :data:`MAX_DISTANCE`.
+        angle: radians to either side of ``yaw`` that are also tried.
+        map: name of the one of several maps that it refers to; None or ``map`` for a single map.
+        within: radius in metres of the circle to search; None for the whole map. It is trusted, unlike the rest: a
+            robot outside is never found.
+        begin, end: range of x to which ``within`` is cut, where one of several maps ends.
     """
 
     x: float
@@ -79,7 +79,7 @@ class PlaceGuess:
             require(plain and MIN_WITHIN <= self.within < MAX_COORDINATE, self, "within", f"{MIN_WITHIN:g} m or more")
 
     def poses(self) -> Floats:
-        """Return (K, 3) x, y and yaw to try, the nearest to the guess first."""
+        """Return (K, 3) x, y and yaw to try, nearest to the guess first."""
         steps = np.arange(-np.ceil(self.distance / _SPACING), np.ceil(self.distance / _SPACING) + 1) * _SPACING
         xy = np.stack(np.meshgrid(steps, steps), axis=-1).reshape(-1, 2)
         far = np.linalg.norm(xy, axis=1)
@@ -88,23 +88,23 @@ class PlaceGuess:
         count = int(np.ceil(reach / _TURN))
         turns = np.arange(-count, count + 1) * (reach / max(count, 1))
         if reach == np.pi:
-            turns = turns[1:]  # both ends are one
+            turns = turns[1:]  # both ends are the same heading
         poses = np.array([(x, y, turn) for x, y in xy for turn in turns])
         unlikely = np.repeat(far / self.distance, len(turns)) + np.tile(np.abs(turns) / max(reach, 1e-9), len(xy))
         poses = poses[np.argsort(unlikely, kind="stable")][:_MAX_POSES]
         return np.asarray(np.add(poses, (self.x, self.y, self.yaw or 0.0)))
 
     def area(self, origin: Floats) -> Circle | None:
-        """Return the circle, about the map's ``origin`` (3,), outside of which nothing is searched; None for none."""
+        """Return the circle to search, about the map's ``origin`` (3,); None for none."""
         if self.within is None:
             return None
         x, y = float(origin[0]), float(origin[1])
         return Circle(self.x - x, self.y - y, self.within, self.begin - x, self.end - x)
 
     def transforms(self, origin: Floats, T_odom_body: Pose) -> tuple[Pose, ...]:
-        """Return the poses as level ``T_map_odom`` (4, 4) about the map's ``origin`` (3,), heights left open (0).
+        """Return the poses as level ``T_map_odom`` (4, 4) about the map's ``origin`` (3,), with unknown heights (0).
 
-        ``T_odom_body`` (4, 4) is of the frame at which the robot is there.
+        ``T_odom_body`` (4, 4) is of the frame at which the guess holds.
         """
         out = []
         for x, y, yaw in self.poses():
@@ -115,12 +115,9 @@ class PlaceGuess:
 
 
 def on_the_ground(guesses: list[Hypothesis], ground: Floats, grid: StationGrid) -> list[Hypothesis]:
-    """Put guesses on the map's ground, on each of its levels; those off the map are left out.
+    """Put guesses of ``T_map_odom``, of unknown height, on each level of the map's ground; drop those off the map.
 
-    Args:
-        guesses: of ``T_map_odom``, whose height is open.
-        ground: (3,) the ground below the robot, odometry frame, metres.
-        grid: of the map's stations.
+    ``ground`` (3,) is the ground below the robot, odometry frame, metres.
     """
     out = []
     for guess in guesses:
@@ -134,7 +131,7 @@ def on_the_ground(guesses: list[Hypothesis], ground: Floats, grid: StationGrid) 
 
 
 def require_ground(guess: PlaceGuess, base_map: BaseMap) -> None:
-    """Raise InputError where a map has no ground near a guess, or within its circle if it has one, or it is none."""
+    """Raise InputError if a guess has another type, or the map has no ground near it or within its circle, if any."""
     if not isinstance(guess, PlaceGuess):
         raise InputError(f"guess is a {type(guess).__name__}; give a coview_stream.PlaceGuess(x, y)")
     area, places = guess.area(base_map.origin), guess.poses()[:, :2] - base_map.origin[:2]
@@ -147,23 +144,23 @@ def require_ground(guess: PlaceGuess, base_map: BaseMap) -> None:
 
 
 class PoseHints:
-    """Hints of a localizer to its search: ``T_map_odom`` of the odometry frame as given.
+    """Hints of a localizer to its search, stored as ``T_map_odom`` of the raw odometry frame.
 
-    The localizer moves that frame's origin to an anchor, another one after each loss; here the move is undone.
+    The localizer moves that frame's origin to an anchor, a new one after each loss; here the move is undone.
 
     Attributes:
-        circle: of the map, metres from its zero, that the robot was said to be in; None for none.
+        circle: circle on the map, metres from its zero, in which the robot is said to be; None for none.
     """
 
     def __init__(self) -> None:
         self._awaited: Pose | None = None  # T_map_body at the next frame
         self._known: tuple[Pose, ...] = ()
-        self._leader: Pose | None = None  # of the search so far
+        self._leader: Pose | None = None  # leading place of the current search
         self._led: tuple[Pose, ...] = ()
         self._guess: PlaceGuess | None = None  # of the place at the next frame
         self._guessed: tuple[Pose, ...] = ()
         self.circle: Circle | None = None
-        self._circle_at = np.zeros(3)  # position by odometry then
+        self._circle_at = np.zeros(3)  # position by odometry at the guess
 
     def clear(self) -> None:
         """Forget all hints, as a place has been accepted."""
@@ -172,16 +169,13 @@ class PoseHints:
         self._guess, self._guessed, self.circle = None, (), None
 
     def guess(self, guess: PlaceGuess) -> None:
-        """Try a guess of the place at the next frame, instead of an earlier one."""
+        """Try a guess of the place at the next frame, instead of an earlier guess."""
         self._guess = guess
 
     def guessed(self, origin: Floats, anchor: Floats, T_odom_body: Pose) -> tuple[Pose, ...]:
-        """Return the guess as ``T_map_odom`` about ``anchor``, heights open.
+        """Return the guess as ``T_map_odom`` about ``anchor``, with unknown heights.
 
-        Args:
-            origin: (3,) of the map.
-            anchor: (3,) as of :meth:`about`.
-            T_odom_body: (4, 4) likewise.
+        ``origin`` (3,) is the map's; the other arguments are as in :meth:`about`.
         """
         if self._guess is not None:
             guess, self._guess = self._guess, None
@@ -191,7 +185,7 @@ class PoseHints:
         return tuple(T @ pose_from(np.eye(3), anchor) for T in self._guessed)
 
     def area(self, anchor: Floats, T_odom_body: Pose) -> Circle | None:
-        """Return the given circle, wider by the distance driven since then; the arguments are as for :meth:`about`.
+        """Return the given circle, widened by the distance driven since then; the arguments are as in :meth:`about`.
 
         It grows in steps, as each step discards the votes so far.
         """
@@ -206,12 +200,12 @@ class PoseHints:
         self._awaited = T_map_body
 
     def odometry_continues(self, T_map_odom: Pose, anchor: Floats) -> None:
-        """Hint, in place of all others, that odometry goes on: ``T_map_odom`` (4, 4) about ``anchor`` (3,)."""
+        """Hint, replacing all others, that odometry continues: ``T_map_odom`` (4, 4) about ``anchor`` (3,)."""
         self._awaited, self._known = None, (T_map_odom @ pose_from(np.eye(3), -anchor),)
         self.forget_leader()
 
     def place_leads(self, T_map_odom: Pose, anchor: Floats) -> None:
-        """Note that ``T_map_odom`` (4, 4) about ``anchor`` (3,) leads the search; no hint until a new search begins."""
+        """Store the search's leader, ``T_map_odom`` (4, 4) about ``anchor`` (3,), as a hint for the next search."""
         self._leader = T_map_odom @ pose_from(np.eye(3), -anchor)
 
     def search_begins_anew(self) -> None:
@@ -220,14 +214,14 @@ class PoseHints:
             self._led = (self._leader,)
 
     def forget_leader(self) -> None:
-        """Forget the place that led: the odometry that it is tied to has been contradicted."""
+        """Forget the leading place, as the odometry that it is tied to was contradicted."""
         self._leader, self._led = None, ()
 
     def about(self, anchor: Floats, T_odom_body: Pose) -> tuple[Pose, ...]:
         """Return the hints as ``T_map_odom`` about ``anchor`` (3,), at a frame of pose ``T_odom_body`` about it."""
         if self._awaited is not None:
             T_map_body, self._awaited = self._awaited, None
-            # level, for both frames are: the robot's lean has changed since
+            # level, as both frames are: the robot's lean has changed since
             turn = rot_z(yaw_of(T_map_body @ inverse(T_odom_body)))
             T = pose_from(turn, T_map_body[:3, 3] - turn @ T_odom_body[:3, 3])
             self._known = (*self._known, T @ pose_from(np.eye(3), -anchor))
@@ -235,9 +229,9 @@ class PoseHints:
 
 
 class HintSchedule:
-    """Schedule of hints: all are tried at every keyframe, until a few in a row have refuted them.
+    """Schedule of hints: all are tried at every keyframe until a few in a row have refuted them.
 
-    Then at every fifth, not never: the sensor may only have been covered.
+    Then they are tried at every fifth rather than never, as the sensor may only have been covered.
     """
 
     def __init__(self) -> None:
@@ -256,7 +250,7 @@ class HintSchedule:
         return [Hypothesis(T) for T in hints]
 
     def tried(self, refuted: bool) -> None:
-        """Count a keyframe at which they were tried, and whether it spoke against all of them."""
+        """Count a keyframe that tried the hints, and whether it refuted all of them."""
         self._refuted = self._refuted + 1 if refuted else 0
         if self._refuted >= _TRIES:
             self._wait = _PAUSE

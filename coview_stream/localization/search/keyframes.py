@@ -1,4 +1,4 @@
-"""Keyframes, the virtual local scans made of them, and a check of the odometry between them (of the paper)."""
+"""Keyframes, the virtual local scans built from them (paper), and a check of the odometry between them."""
 
 from __future__ import annotations
 
@@ -15,18 +15,18 @@ from coview_stream.geometry.arrays import Floats, Ints
 from coview_stream.geometry.transforms import Points, Pose
 from coview_stream.localization.calibration.calibration import Calibration, RawScan
 
-_PENDING_POINTS = 200_000  # beyond which the frames of a standing robot are thinned again
-_RECENT = 5  # keyframes that are held raw
-_PARTS = 3  # groups of keyframes whose points are gathered
-_SMEARED = np.radians(1.0)  # change of the level from which keyframes are gathered again
+_PENDING_POINTS = 200_000  # above which the frames of a standing robot are thinned again
+_RECENT = 5  # keyframes that are kept raw
+_PARTS = 3  # groups of keyframes for gathering points
+_SMEARED = np.radians(1.0)  # change of the level that makes keyframes be gathered again
 
 # of OdometryCheck; _MIN_SHARE is set by hand between the shares in its docstring
 _VOXEL, _BITS = 1.0, 21  # metres; bits of a coordinate in a voxel's key
-_STRIDE = 2.0  # metres between reference frames
-_POINTS = 2000  # of a frame, compared
-_MIN_POINTS = 300  # of a frame that is judged
+_STRIDE = 2.0  # metres, largest distance between reference frames
+_POINTS = 2000  # compared per frame
+_MIN_POINTS = 300  # of a frame, to judge it
 _MIN_SHARE = 0.22
-_PATIENCE = 3  # frames in a row: one may be dust
+_PATIENCE = 3  # successive frames, as one may be dust
 
 
 def _no_points() -> Points:
@@ -61,12 +61,12 @@ class Keyframe:
 
 
 class KeyframeBuffer:
-    """Buffer of the newest keyframes, made from the frames that are added.
+    """Buffer of the newest keyframes, built from the added frames.
 
     All coordinates are in the odometry frame, which must be gravity aligned and near its own origin. For virtual local
     scans the points of up to ``capacity`` keyframes are gathered, one per voxel, levelled by the calibration of their
-    time. The newest five keyframes are held raw and levelled when they are read; they replace the gathered points when
-    the calibration has moved by more than a degree.
+    time. The newest five keyframes are kept raw and levelled on access; they replace the gathered points when the
+    calibration has moved by more than a degree.
 
     Args:
         config: distance, number and voxels of the keyframes.
@@ -74,7 +74,7 @@ class KeyframeBuffer:
 
     Attributes:
         keyframes: the newest five, oldest first.
-        calibration: of the newest frame; levels all points that are read.
+        calibration: of the newest frame; levels all points on access.
     """
 
     def __init__(self, config: KeyframeConfig, reach: float = math.inf) -> None:
@@ -83,18 +83,18 @@ class KeyframeBuffer:
         self.keyframes: deque[Keyframe] = deque(maxlen=min(config.capacity, _RECENT))
         self.calibration = Calibration()
         self._gathered_by: deque[Calibration] = deque(maxlen=self.keyframes.maxlen)
-        self._levelled_at: Floats | None = None  # position where the gathered points were last levelled again
+        self._levelled_at: Floats | None = None  # position of the last new levelling
         self._pending: list[RawScan] = []  # frames since the newest keyframe
         self._part_size = max(1, config.capacity // _PARTS)
         self._parts: deque[Points] = deque(maxlen=config.capacity // self._part_size)  # one per voxel and part
         self._in_part = 0  # keyframes in the newest part
 
     def add(self, scan: RawScan, stamp: float, frame: Points | None = None) -> Keyframe | None:
-        """Add a frame; return the keyframe that it completes, if any, which holds a copy of ``frame``."""
+        """Add a frame; return the keyframe that it completes, if any, with a copy of ``frame``."""
         self.calibration = scan.calibration
         leans = any(self.calibration.leans_from(earlier) > _SMEARED for earlier in self._gathered_by)
         at = self._levelled_at
-        # from the position of the last levelling nothing new is seen
+        # the position of the last levelling shows nothing new
         anew = leans and (at is None or float(np.linalg.norm(scan.position - at)) >= self.config.distance)
         if anew:
             self._gather_again()
@@ -126,7 +126,7 @@ class KeyframeBuffer:
     def recent(self, count: int) -> Points:
         """Return the points (N, 3) of the newest ``count`` keyframes, five at most, and of the frames since.
 
-        The newest come first: thinning keeps the first point of a voxel, and old ones are off by odometry's drift.
+        The newest come first, as thinning keeps the first point of a voxel, and old ones have odometry's drift.
         """
         return self._levelled([*(keyframe.scan for keyframe in list(self.keyframes)[-count:]), *self._pending])
 
@@ -141,9 +141,9 @@ class KeyframeBuffer:
         return np.concatenate(parts) if parts else _no_points()
 
     def virtual_scan(self, centre: Floats, radius: float, voxel: float) -> Points:
-        """Make a virtual local scan: all keyframes' points within ``radius`` metres of ``centre``, one per voxel.
+        """Build a virtual local scan: all keyframes' points within ``radius`` metres of ``centre``, one per voxel.
 
-        ``radius`` is at most the buffer's reach, and ``voxel`` at least as large as the buffer's.
+        ``radius`` is at most the buffer's reach, and ``voxel`` at least the buffer's.
         """
         near = [_within(part, centre, radius) for part in self._parts]
         return self._unique(np.concatenate(near), voxel)
@@ -157,7 +157,7 @@ class KeyframeBuffer:
         self._pending = pending
 
     def clear(self) -> None:
-        """Forget all keyframes: odometry does not connect them with the next frame."""
+        """Forget all keyframes, as odometry does not connect them with the next frame."""
         self.keyframes.clear()
         self._gathered_by.clear()
         self._levelled_at = None
@@ -166,7 +166,7 @@ class KeyframeBuffer:
         self._in_part = 0
 
     def _merged(self, newest: RawScan) -> RawScan:
-        """Return all frames since the newest keyframe as one, the newest first."""
+        """Merge all frames since the newest keyframe, the newest first."""
         frames = [scan.levelled(self.calibration) for scan in reversed(self._pending)]
         return RawScan(self._unique(np.concatenate(frames)), newest.T_odom_body, self.calibration)
 
@@ -187,20 +187,20 @@ def _within(points: Points, centre: Floats, radius: float) -> Points:
 
 
 class OdometryCheck:
-    """Check that consecutive frames overlap where odometry puts them, while there is no map pose to check against.
+    """Check that successive frames overlap under odometry, while there is no map pose to check against.
 
-    Keyframes may be combined only if odometry is right between them. Where it is not (the robot was lifted and put
-    down, its odometry jumped), the old ones spoil the search for as long as they are in the buffer. So each frame is
-    compared with a reference frame at most two metres away: the share of its points in a cubic metre in which the
-    reference has points. In simulated towns and forests (worlds 5101, 5103 and 5108) that share was 0.31 to 0.9 with
-    right odometry, at most 0.30 two metres off and at most 0.19 four metres off.
+    Keyframes may be combined only if the odometry between them is right. Otherwise (the robot was lifted and put down,
+    odometry jumped) the old ones spoil the search for as long as they are in the buffer. So each frame is compared with
+    a reference frame at most two metres away: by the share of its points in cubic metres that contain points of the
+    reference. In simulated towns and forests (worlds 5101, 5103 and 5108) that share was 0.31 to 0.9 with right
+    odometry, at most 0.30 two metres off and at most 0.19 four metres off.
     """
 
     def __init__(self) -> None:
         self.clear()
 
     def clear(self) -> None:
-        """Forget the reference frame: the next frame becomes it."""
+        """Forget the reference frame; the next frame becomes the reference."""
         self._voxels: Ints | None = None
         self._position = np.zeros(3)
         self._mismatches = 0
@@ -208,9 +208,8 @@ class OdometryCheck:
     def contradicts(self, points: Points, position: Floats) -> bool:
         """Compare a frame; True if it is the third in a row that does not overlap the reference frame.
 
-        Args:
-            points: (N, 3) of the frame, one per voxel, odometry frame, metres.
-            position: (3,) of the sensor, same frame.
+        ``points`` (N, 3) of the frame, one per voxel, and ``position`` (3,) of the sensor are in the odometry frame,
+        metres.
         """
         if len(points) < _MIN_POINTS:
             return False
@@ -228,6 +227,6 @@ class OdometryCheck:
 
 
 def _voxel_keys(points: Points) -> Ints:
-    """Return the number (N,) of the cubic metre that each point (N, 3) lies in."""
+    """Return the number (N,) of each point's (N, 3) cubic metre."""
     cell = np.floor(points / np.float32(_VOXEL)).astype(np.int64) + (1 << (_BITS - 1))
     return np.asarray((cell[:, 0] << 2 * _BITS) | (cell[:, 1] << _BITS) | cell[:, 2])

@@ -1,4 +1,4 @@
-"""Place recognizers: keyframes vote for places of the map, and the best places are the search's hypotheses."""
+"""Place recognizers: keyframes vote for places of the map, and the best places become hypotheses of the search."""
 
 from __future__ import annotations
 
@@ -18,10 +18,10 @@ if TYPE_CHECKING:  # imports SciPy, which takes a while
 
 
 class PlaceRecognizer(Protocol):
-    """Interface of place recognition: keyframes vote, and the votes name places."""
+    """Place recognizer: keyframes vote, and their votes name places."""
 
     def vote(self, request: SearchRequest) -> None:
-        """Add the votes of one keyframe; one with too few points has none."""
+        """Add the votes of one keyframe; too few points give none."""
         ...
 
     def hypotheses(self) -> list[Hypothesis]:
@@ -35,7 +35,7 @@ class PlaceRecognizer(Protocol):
 
 @dataclass(frozen=True)
 class SearchIndex:
-    """The data that the recognizers of all searches of one map share; None for a recognizer that is not used."""
+    """The data shared by the recognizers of all searches of one map; None for an unused recognizer."""
 
     retrieval: Retrieval | None
     learned: FeatureMatcher | None
@@ -44,7 +44,7 @@ class SearchIndex:
     def of(cls, base_map: BaseMap, config: LocalizerConfig, load: bool = True) -> SearchIndex:
         """Return the index for ``config.reloc``, without spectra, and without the network unless ``load``.
 
-        ``auto`` warns of learned features that cannot be used, and goes without them.
+        ``auto`` warns of learned features that cannot be used, and does without them.
 
         Raises:
             MapError, InputError: as :meth:`BaseMap.require_features`.
@@ -61,7 +61,7 @@ class SearchIndex:
         return cls(retrieval, FeatureMatcher(base_map.learned, base_map.stations, config.learned, block=block))
 
     def prepare(self) -> None:
-        """Do the work that the first query would wait for; CoViewError if something is missing."""
+        """Compute ahead of the first query; CoViewError if something is missing."""
         if self.retrieval is not None:
             self.retrieval.prepare()
         if self.learned is not None:

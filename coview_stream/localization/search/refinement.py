@@ -1,8 +1,8 @@
 """Refinement: registration of the most probable place (eq. 13), and the modes of a place that may be accepted.
 
-A place is all poses within two metres of its best pose. Registration converges to the nearest fitting pose; where the
-scan shows little, or the site has changed, that may be a metre off. So registration also starts from poses all around,
-and the results are weighed by the scan's log-likelihood ratio, as places are.
+A place comprises all poses within two metres of its best pose. Registration converges to the nearest fitting pose;
+where the scan shows little, or the site has changed, that may be a metre off. So registration also starts from poses
+all around, and the results are weighted by the scan's log-likelihood ratio, like places.
 """
 
 from __future__ import annotations
@@ -38,11 +38,11 @@ from coview_stream.localization.search.consensus import Hypothesis
 from coview_stream.localization.search.request import SearchRequest, same_place
 from coview_stream.localization.search.scoring import BASIN_ANGLE, BASIN_DISTANCE
 
-_WIDEST = 1.0  # metres: coarser scales are not needed after scoring, which moves to the best pose nearby
-_EVERY = 3  # one of three points is registered: it changes the score by 0.002 and the pose by a centimetre
-_AROUND = 1.2  # metres to the other starts: a little more than registration reaches
+_WIDEST = 1.0  # metres; scoring moves to the best pose nearby, so coarser scales are not needed
+_EVERY = 3  # every third point is registered: changes the score by 0.002 and the pose by a centimetre
+_AROUND = 1.2  # metres to the other starts, slightly beyond the reach of registration
 _DIRECTIONS = 8
-_SAME_METRES, _SAME_RADIANS = 0.3, np.radians(2.0)  # nearer poses are one mode
+_SAME_METRES, _SAME_RADIANS = 0.3, np.radians(2.0)  # closer poses are one mode
 
 
 @dataclass(frozen=True)
@@ -52,7 +52,7 @@ class Modes:
     Attributes:
         best: the most probable mode.
         distances: (M,) metres from the best mode.
-        probabilities: (M,) sum up to one.
+        probabilities: (M,) add up to one.
     """
 
     best: Hypothesis
@@ -91,10 +91,10 @@ def register_place(
 
 
 def levelled_by_frame(leader: Pose, request: SearchRequest, config: RegistrationConfig, local_maps: LocalMaps) -> Pose:
-    """Return a ``T_map_odom`` (4, 4) with roll and pitch of the newest frame, registered alone; as it is if that fails.
+    """Return a ``T_map_odom`` (4, 4) with roll and pitch of the newest frame, registered alone; unchanged on failure.
 
-    The frames of several keyframes stand where odometry has them, so together they show odometry's gravity: of a lean
-    of the sensor only a part is left.
+    Several keyframes are combined by odometry, so together they follow odometry's gravity: only a part of the sensor's
+    lean remains.
     """
     T_odom_body = request.T_odom_body
     frame = prepare_scan(transform(T_odom_body, request.cloud), T_odom_body[:3, 3], config)
@@ -115,7 +115,7 @@ def find_modes(
     place: Hypothesis, leader: Hypothesis, scan: ObservedScan, request: SearchRequest, base_map: BaseMap,
     config: LocalizerConfig, local_maps: LocalMaps,
 ) -> Modes:  # fmt: skip
-    """Register a scan from poses around ``leader``, the registered ``place``, and weigh the results within it."""
+    """Register a scan from poses around ``leader``, the registered ``place``, and weight the results within it."""
     candidates = [leader]
     for angle in 2.0 * np.pi * np.arange(_DIRECTIONS) / _DIRECTIONS:
         start = leader.T_map_odom.copy()
@@ -129,7 +129,7 @@ def find_modes(
     ratios = log_likelihood_ratios(observed.shares, background)
 
     def gap(k: int, other: int) -> tuple[float, float]:
-        """Metres and radians between two poses of the robot."""
+        """Return metres and radians between two poses of the robot."""
         step = boxminus(poses[k] @ scan.T_odom_body, poses[other] @ scan.T_odom_body)
         return float(np.linalg.norm(step[3:])), float(np.linalg.norm(step[:3]))
 

@@ -13,8 +13,8 @@ from coview_stream.geometry.transforms import Circle, Points, Pose, inverse, pos
 from coview_stream.localization.calibration.calibration import Calibration
 from coview_stream.localization.search.keyframes import Keyframe, KeyframeBuffer
 
-_SUBMAP_KEYFRAMES = 4  # newest keyframes that are registered: drift smears more of them
-SAME_DISTANCE, SAME_ANGLE = 2.0, float(np.radians(5.0))  # metres, radians: nearer registered hypotheses are one
+_SUBMAP_KEYFRAMES = 4  # newest keyframes that are registered; drift smears more of them
+SAME_DISTANCE, SAME_ANGLE = 2.0, float(np.radians(5.0))  # metres, radians: closer registered hypotheses are one
 
 
 class Epoch(NamedTuple):
@@ -42,7 +42,7 @@ class RequestSpec:
 
     Attributes:
         descriptor: of the local scan; None if no scan is needed.
-        reach: radius of the surroundings, metres; None if they are not needed.
+        reach: radius of the surroundings, metres; None if unneeded.
     """
 
     descriptor: DescriptorConfig | None
@@ -50,7 +50,7 @@ class RequestSpec:
 
 
 class EarlierKeyframe(NamedTuple):
-    """A keyframe that has been searched for, levelled by the present calibration; as of :class:`SearchRequest`."""
+    """An earlier searched keyframe, levelled by the present calibration; fields as in :class:`SearchRequest`."""
 
     T_odom_body: Pose
     submap: Points
@@ -68,14 +68,14 @@ class SearchRequest:
         submap: (N, 3) float32 points to register, of the newest keyframes, odometry frame.
         cloud: (N, 3) float32 newest frame, body frame.
         travelled: metres that odometry had driven.
-        epoch: a request of another epoch starts the search from nothing.
-        hints: (4, 4) each, ``T_map_odom`` that may be right: judged like the votes' hypotheses.
-        guesses: (4, 4) each, ``T_map_odom`` by a :class:`PlaceGuess`, heights open: judged likewise.
-        surroundings: (N, 3) float32 points within ``RequestSpec.reach``, odometry frame; empty if not needed.
-        calibration: has levelled ``cloud``.
+        epoch: a request of another epoch restarts the search.
+        hints: possible ``T_map_odom``, each (4, 4), judged like the votes' hypotheses.
+        guesses: ``T_map_odom`` by a :class:`PlaceGuess`, each (4, 4), with unknown heights, judged likewise.
+        surroundings: (N, 3) float32 points within ``RequestSpec.reach``, odometry frame; empty if unneeded.
+        calibration: that levelled ``cloud``.
         area: the only part of the map to search, metres from its zero; None for all of it.
-        earlier: keyframes that the search goes on with, oldest first, where clouds were levelled anew.
-        lean_prior: log-probability of the lean that levels the clouds, where it was chosen to fit a leading place.
+        earlier: keyframes with which the search continues, oldest first, where clouds were levelled again.
+        lean_prior: log-probability of the lean that levels the clouds, where it was fitted at a leading place.
     """
 
     stamp: float
@@ -99,7 +99,7 @@ class SearchRequest:
         return np.asarray(self.T_odom_body[:3, 3])
 
     def turned(self, R: Floats) -> SearchRequest:
-        """Return the request with its clouds to register turned about the body by R (3, 3), axes of odometry."""
+        """Return the request with the clouds to register rotated about the body by R (3, 3), axes of odometry."""
         T = pose_from(R, self.position - R @ self.position)
         T_body = pose_from(self.T_odom_body[:3, :3].T @ R @ self.T_odom_body[:3, :3], np.zeros(3))
         return replace(self, submap=transform(T, self.submap), cloud=transform(T_body, self.cloud))
@@ -117,7 +117,7 @@ class SearchRequest:
         guesses: tuple[Pose, ...] = (),
         area: Circle | None = None,
     ) -> SearchRequest:
-        """Make the request of a buffer's newest keyframe; ``cloud`` (N, 3) is the newest frame, body frame."""
+        """Build the request of a buffer's newest keyframe; ``cloud`` (N, 3) is the newest frame, body frame."""
         scan = surroundings = _no_points()
         if spec.descriptor is not None:
             scan = buffer.virtual_scan(keyframe.position, spec.descriptor.radius, spec.descriptor.voxel)

@@ -1,8 +1,8 @@
 """Retrieval: a virtual local scan compared with the virtual scans of a map's stations at every shift (eqs 5-9).
 
-A search compares with all stations of a map or of a circle. Where they are very many, one station of each six-metre
-square is compared, by the first tier of its code alone, as the surroundings look much the same two metres beside a
-station. The places that keyframes agree on are then moved to the best station of their square.
+A search compares all stations of a map or of a circle. Of very many stations only one per six-metre square is compared,
+by the first tier of its code alone, as the surroundings look much the same two metres away. The places that keyframes
+agree on are then moved to the best station of their square.
 """
 
 from __future__ import annotations
@@ -26,11 +26,11 @@ from coview_stream.geometry.rasters import argsmallest
 from coview_stream.geometry.transforms import Circle
 from coview_stream.localization.search.consensus import Consensus, Hypothesis
 
-_MIN_STATIONS, _SHARE = 2048, 32  # best stations whose shifts are compared: at least so many, and one in 32
+_MIN_STATIONS, _SHARE = 2048, 32  # best stations whose shifts are compared: at least 2048, and one in 32
 _PER_STATION = 0.5  # candidates per such station
-_SQUARE = 6.0  # metres: all of it is within 4.3 m of the middle; chosen between 4 and 6 by bench city
-_ORDINARY = 65_536  # stations that are all compared: 6 ms for one core
-_BLOCK = 8192  # stations whose exact spectra are made at a time
+_SQUARE = 6.0  # metres, all within 4.3 m of the middle; chosen between 4 and 6 by bench city
+_ORDINARY = 65_536  # largest number of stations that are all compared: 6 ms for one core
+_BLOCK = 8192  # stations whose exact spectra are computed at a time
 
 
 class CoViewVote:
@@ -51,11 +51,11 @@ class CoViewVote:
         return self._index.sectors
 
     def candidates(self) -> tuple[Ints, Ints]:
-        """Return stations and shifts (K,): the best peaks over the heading at the best stations."""
+        """Return stations and shifts (K,): the best peaks over heading at the best stations."""
         count = max(_MIN_STATIONS, len(self._index) // _SHARE)
         stations = argsmallest(self._index.best(self._query), count)
         scores = self._index.all_shifts(self._query, stations)
-        # the best heading of each station is at least as good as the last station's
+        # every station has a score at least as good as the last station's best
         station, shift = np.divmod(np.flatnonzero(scores <= scores[-1].min()), self.sectors)
         here = scores[station, shift]
         previous, following = scores[station, shift - 1], scores[station, (shift + 1) % self.sectors]
@@ -64,7 +64,7 @@ class CoViewVote:
         return stations[station[chosen]], shift[chosen]
 
     def at(self, stations: Ints, shifts: Ints) -> Floats32:
-        """Return z-scores (K,) of stations at shifts, negative is better; 0 for station -1."""
+        """Return z-scores (K,) of stations at shifts, lower is better; 0 for station -1."""
         return self._index.at(self._query, stations, shifts)
 
     def screened(self, codes: StationCodes, stations: Ints, shifts: Ints) -> Floats32:
@@ -82,9 +82,9 @@ class SearchStations:
 
     Attributes:
         index: of the descriptors.
-        grid: look-up by position; its blocks are the squares, if there are any.
-        numbers: (K,) of the stations among the map's; None if they are all of the map.
-        squares: of stations that one station represents; None if each station represents itself alone.
+        grid: look-up by position; its blocks are the squares, if any.
+        numbers: (K,) of the stations in the map; None if they are all of the map's.
+        squares: of stations that share one compared station; None if every station is compared.
     """
 
     index: StationIndex
@@ -94,7 +94,7 @@ class SearchStations:
 
     @classmethod
     def of(cls, index: StationIndex, grid: StationGrid, chosen: Ints | None = None) -> SearchStations:
-        """Choose among the stations of a map, or among those numbered ``chosen`` (C,)."""
+        """Choose from the stations of a map, or from its stations ``chosen`` (C,)."""
         stride, count = int(_SQUARE / grid.block), len(grid) if chosen is None else len(chosen)
         if count > _ORDINARY and stride > 1:
             members = _members(grid, np.arange(count) if chosen is None else chosen, stride)
@@ -111,12 +111,10 @@ class SearchStations:
         return len(self.grid)
 
     def on_the_map(self, places: Sequence[Hypothesis], vote: CoViewVote, keyframes: int) -> list[Hypothesis]:
-        """Return places with the map's numbers of their stations, each on the best station of its square.
+        """Return places with their stations' numbers in the map, each on the best station of its square.
 
-        Args:
-            places: as :meth:`Consensus.hypotheses` returns them.
-            vote: of the newest keyframe; compares the stations of a square.
-            keyframes: number of keyframes that have voted.
+        ``places`` are those of :meth:`Consensus.hypotheses`, ``vote`` is the newest keyframe's, and ``keyframes`` the
+        number that have voted.
         """
         if self.squares is not None:
             return self.squares.refined(places, vote, keyframes)
@@ -169,10 +167,10 @@ def _members(grid: StationGrid, stations: Ints, stride: int) -> Int32s:
     off_centre = np.abs(cells - squares * stride - stride // 2).max(axis=1).astype(np.int8)
     squares -= squares.min(axis=0)
     key = squares[:, 0] * (int(squares[:, 1].max()) + 1) + squares[:, 1]
-    del cells, squares  # of a million stations they are 16 MB each
+    del cells, squares  # 16 MB each for a million stations
     height = grid.stations[stations, 2]
     order = np.lexsort((height, key))
-    # a storey ends at a gap in the heights: single cells may lack the storey below
+    # a storey ends at a gap in the heights, as single cells may lack the storey below
     change = (np.diff(key[order]) != 0) | (np.diff(height[order]) >= LEVEL_GAP)
     key[order] = np.cumsum(np.append(0, change))
     order = np.lexsort((off_centre, key))
@@ -185,17 +183,17 @@ def _members(grid: StationGrid, stations: Ints, stride: int) -> Int32s:
 
 
 class Retrieval:
-    """The stations of a map that votes are compared with, shared by all searches of the map."""
+    """The compared stations of a map, shared by all searches of the map."""
 
     def __init__(self, base_map: BaseMap) -> None:
         self.base_map = base_map
 
     def prepare(self) -> None:
-        """Do the work that the first vote would wait for."""
+        """Compute ahead of the first vote."""
         self._whole.index.prepare()
 
     def compared(self, area: Circle | None = None) -> SearchStations:
-        """Return the stations that votes compare: of the map, or within a circle, metres from the map's zero.
+        """Return the compared stations, of the map or within a circle in metres from the map's zero.
 
         Raises:
             ValueError: a circle without any station.
@@ -214,17 +212,17 @@ class Retrieval:
 
 
 class StationConsensus:
-    """Consensus of keyframes by their co-view descriptors on the stations of a map, or of a circle on it."""
+    """Consensus of keyframes by their co-view descriptors, on the stations of a map or of a circle on it."""
 
     def __init__(self, retrieval: Retrieval, config: ConsensusConfig) -> None:
-        """Begin without votes; the compared stations are chosen at the first vote."""
+        """Start without votes; the compared stations are chosen at the first vote."""
         self.retrieval = retrieval
         self.config = config
         self._area: Circle | None = None
         self._voted: tuple[SearchStations, Consensus, CoViewVote] | None = None  # and the newest vote
 
     def __len__(self) -> int:
-        """Return how many keyframes have voted."""
+        """Return the number of keyframes that have voted."""
         return 0 if self._voted is None else len(self._voted[1])
 
     def clear(self) -> None:
@@ -232,12 +230,12 @@ class StationConsensus:
         self._voted = None
 
     def vote(self, centre: Floats, query: Mapping[Channel, Descriptor], area: Circle | None = None) -> None:
-        """Add one keyframe's vote; another area than the last vote's starts again.
+        """Add one keyframe's vote; another ``area`` than the last vote's restarts the consensus.
 
         Args:
             centre: (3,) zero of the descriptors, z on the ground; odometry frame, metres.
             query: descriptors (R, S) by channel.
-            area: of the map, metres from its zero, outside of which no station is compared; None for none.
+            area: circle of compared stations, metres from the map's zero; None for all.
         """
         if self._voted is None or area != self._area:
             self._area = area
@@ -260,7 +258,7 @@ class StationConsensus:
 def exact_distances(descriptors: npt.NDArray[np.float16], query: Descriptor) -> Floats32:
     """Return the distances (M, S) in [0, 2] of descriptors (M, R, S) to a query (R, S) at every shift (eqs 7-9).
 
-    Shift n means yaw -2 pi n / S. Takes seconds and gigabytes on large maps: for comparison with the index.
+    Shift n means yaw -2 pi n / S. Takes seconds and gigabytes on large maps; used to check the index.
     """
     volume = np.empty((len(descriptors), query.shape[-1]), dtype=np.float32)
     for start in range(0, len(descriptors), _BLOCK):

@@ -41,11 +41,11 @@ from coview_stream.localization.search.request import SAME_ANGLE, SAME_DISTANCE
 
 _PROMISING = 96  # best hypotheses that are looked up with many points
 _FOLLOWED = 64  # best places that the next keyframe observes again
-_KEPT = 16  # places that stay by their evidence, at any rank at the newest keyframe
-_KEYFRAMES = 12  # keyframes with observations: the newest, and the earlier ones farthest apart
-_NEWEST = 8  # keyframes that are searched for a moved part
+_KEPT = 16  # places kept by their evidence, whatever their rank at the newest keyframe
+_KEYFRAMES = 12  # keyframes with observations: the newest and the most spread earlier ones
+_NEWEST = 8  # newest keyframes, searched for a moved part
 _CHANCE = 112  # places that measure the correlation of chance over keyframes
-_CHANCE_DISTANCE, _CHANCE_ANGLE = 6.0, np.radians(20.0)  # from the leader: nearer places share its explanation
+_CHANCE_DISTANCE, _CHANCE_ANGLE = 6.0, np.radians(20.0)  # from the leader; closer places share its explanation
 BASIN_DISTANCE, BASIN_ANGLE = SAME_DISTANCE, float(np.radians(15.0))
 """Metres and radians from the leader within which registration converges to it."""
 
@@ -78,11 +78,11 @@ class Scored:
 
     Attributes:
         rivals: all places.
-        places: followed places, the most probable first.
+        places: followed places, most probable first.
         error: probability that the robot is not at the first place.
         none: probability that it is at no place of the map.
         by_chance: expected number of chance places as good as the first.
-        second: most probable place elsewhere than the first; None without any.
+        second: most probable place other than the first; None without any.
         moved: part of the scans that fits elsewhere than at the first.
     """
 
@@ -96,15 +96,15 @@ class Scored:
 
     @property
     def left(self) -> int:
-        """Number of equally probable places that are as uncertain as these (the exponential of their entropy)."""
+        """Effective number of places: the number of equally probable places with the same entropy."""
         probability = np.array([place.probability for place in self.places])
         share = probability[probability > 0.0] / max(float(probability.sum()), 1e-300)
         return round(float(np.exp(-(share * np.log(share)).sum())))
 
     def together_with(self, other: Scored) -> Scored:
-        """Return these places with the error by both readings of the scan, which have the same first place.
+        """Return these places with the error by both readings of the scan, which share their first place.
 
-        The odds against "none", which is one and the same, add up; the other's places are only in the error.
+        The odds against "none", which is common to both, add up; the other's places count only in the error.
         """
         none = [max(each.none, 1e-300) for each in (self, other)]
         right = sum((1.0 - each.error) / part for each, part in zip((self, other), none, strict=True))
@@ -117,7 +117,7 @@ class Scored:
         )
 
     def doubted(self, moved: MovedPart) -> Scored:
-        """Add the error by a moved part: either part may be the unmoved one."""
+        """Add the error by a moved part, as either part may be the unmoved one."""
         return replace(self, error=min(1.0, self.error + 0.5 * moved.probability), moved=moved)
 
 
@@ -127,8 +127,8 @@ class Followed:
 
     Attributes:
         hypotheses: at the newest keyframe.
-        votes: (P,) ranks in the newest votes that named each, from 0.
-        observed: (P, W, 15) observations at and around them at the keyframes, oldest first.
+        votes: (P,) rank of each in the newest votes that named it, from 0.
+        observed: (P, W, 15) observations at and around the places at the keyframes, oldest first.
         newest: (P,) rows among the newest keyframe's poses.
     """
 
@@ -154,7 +154,7 @@ class _Observed:
 
     Attributes:
         poses: (H, 4).
-        shares: (H, 15) observations, around the places' best hypotheses as well.
+        shares: (H, 15) observations, also around the places' best hypotheses.
         scores: (H,) evidence scores.
         groups: rows by place, best hypothesis and best place first.
     """
@@ -179,8 +179,8 @@ class PlaceScorer:
     """Scorer of a search's places, with the keyframes' observations there.
 
     Attributes:
-        starts: how often the search has started since a place was accepted.
-        area: the only part of the map that is searched; None for all of it.
+        starts: number of starts of the search since a place was accepted.
+        area: the only searched part of the map; None for all of it.
     """
 
     def __init__(self, base_map: BaseMap) -> None:
@@ -209,7 +209,7 @@ class PlaceScorer:
         self._scatter: list[Floats] = []
 
     def go_on_with(self, scans: list[ObservedScan]) -> None:
-        """Begin with earlier keyframes, oldest first: places are compared by them as well."""
+        """Start with earlier keyframes, oldest first, by which places are compared, too."""
         self._scans = scans
         self._scatter = [np.full(4, np.nan)] * len(scans)
         self._followed = replace(
@@ -228,7 +228,7 @@ class PlaceScorer:
             votes: ranks of the hypotheses in their votes, from 0; any number for a hint.
             hints: number of pose hints.
             scan: of the keyframe.
-            prior: log-probability that the scan is to be read like this, beside "at none of the places".
+            prior: log-probability of this reading of the scan, added to the ratios of its places.
         """
         followed, voted = self._followed, len(hypotheses) - hints
         count = len(followed.hypotheses)
@@ -263,7 +263,7 @@ class PlaceScorer:
         return Scored(rivals, places, chances.error(~elsewhere), chances.none, by_chance, second)
 
     def _thin_out(self) -> None:
-        """Drop the keyframe nearest to its neighbours if there are too many; the first and the newest stay."""
+        """Drop the keyframe closest to its neighbours if there are too many; the first and the newest stay."""
         if len(self._scans) <= _KEYFRAMES:
             return
         steps = np.linalg.norm(np.diff([scan.body for scan in self._scans], axis=0), axis=1)
@@ -294,7 +294,7 @@ class PlaceScorer:
             np.concatenate([getattr(part, name) for part in parts]) for name in ("poses", "shares", "scores")
         )
         coarse = _Observed(poses, shares, scores, [])
-        # a few points rule out most hypotheses; more points move the rest on, decimetres as a rule, and rank them
+        # a few points rule out most hypotheses; more points move the rest again, mostly by decimetres, and rank them
         promising = np.argsort(-scores * coarse.inside, kind="stable")[:_PROMISING]
         closer = scan.many.look_up(layers, poses[promising], Move.NEAR)
         poses[promising], shares[promising], scores[promising] = closer.poses, closer.shares, closer.scores
@@ -306,7 +306,7 @@ class PlaceScorer:
     def _follow(
         self, scan: ObservedScan, observed: _Observed, hypotheses: list[Hypothesis], ranks: Ints, hints: int
     ) -> Followed:
-        """Choose the places to follow: the best now, the best so far, and those of hints."""
+        """Choose the places to follow: the best at this keyframe, the best so far, and those of hints."""
         before = self._followed
         count = len(before.votes)
         T = scan.transforms(observed.poses)
@@ -315,7 +315,7 @@ class PlaceScorer:
             origin = min(group)
             hinted = hints > 0 and max(group) >= len(hypotheses) - hints
             if number < _FOLLOWED or origin < min(_KEPT, count) or hinted:
-                # the place's votes, if any: a hint there does not remove them
+                # keep the votes of the place, if any, even if a hint is there
                 hypothesis = next(
                     (hypotheses[k] for k in group if hypotheses[k].station is not None), hypotheses[group[0]]
                 )
@@ -327,7 +327,7 @@ class PlaceScorer:
         history = np.empty((len(chosen), len(self._scans), NEARBY_VARIANCE.stop), dtype=np.float32)
         row = np.array(origins, dtype=np.int64)
         if len(self._scans):
-            # a pose that more keyframes have moved is better: the best places are looked up anew from there
+            # a pose refined by more keyframes is better: the best places are looked up again from there
             anew = row < min(_KEPT, count)
             history[~anew] = before.observed[row[~anew]]
             history[anew] = self._look_back(T[newest[anew]])
@@ -335,7 +335,7 @@ class PlaceScorer:
         return Followed([place for _, place in chosen], votes, shares, newest)
 
     def _look_back(self, T_map_odom: Floats) -> Floats32:
-        """Return the earlier keyframes' observations (P, W, 15) at new places, with the drift since undone."""
+        """Return the earlier keyframes' observations (P, W, 15) at new places, corrected for drift."""
         out = np.empty((len(T_map_odom), len(self._scans), NEARBY_VARIANCE.stop), dtype=np.float32)
         for k in reversed(range(len(self._scans))):
             scan = self._scans[k]
@@ -382,7 +382,7 @@ class PlaceScorer:
             # places around the leader share its explanation
             chance, distant = (_apart(at, leader, _CHANCE_DISTANCE, _CHANCE_ANGLE) for at in (places, poses))
             self._scatter[-1] = scatter(observed.shares[first][chance])
-        return ratios, float(left[:3].mean()) * ratio_variances(mean, background)  # shrinks as the scatter does
+        return ratios, float(left[:3].mean()) * ratio_variances(mean, background)  # shrinks like the scatter
 
     def _over_time(self, observed: _Observed, first: Ints, scan: ObservedScan) -> tuple[Ints, Floats32]:
         """Return a sample (N,) of the places, and the observations (N, W, 15) of all keyframes there."""

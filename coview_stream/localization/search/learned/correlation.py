@@ -1,4 +1,4 @@
-"""Dense correlation of a query's features with a map's at every cell and heading, by FFT in overlapping blocks."""
+"""Dense correlation of a query's features with a map's at all cells and headings, by FFT in overlapping blocks."""
 
 from __future__ import annotations
 
@@ -11,13 +11,13 @@ import numpy.typing as npt
 from coview_stream.geometry.arrays import Bools, Complexes, Floats, Floats32, Ints, Reals
 
 MIN_COVERAGE = 0.6
-"""Least share of a query's weight on surveyed cells: there the scatter has grown by 1.3."""
+"""Least share of a query's weight on surveyed cells; at this share the scatter has grown by 1.3."""
 
-_BLOCK = 96  # cells: fast to transform, and two thirds of it are valid
+_BLOCK = 96  # cells: fast to transform, with two thirds valid
 _MARGIN = 16  # cells of 2 m from the middle of a 64 m query to its edge
 _MAX_BYTES = 512 << 20  # memory for the spectra
-_BATCH_BYTES = 32 << 20  # of the products that are transformed back together
-_EPSILON = 1e-6  # a smaller weight counts as zero
+_BATCH_BYTES = 32 << 20  # of the products transformed back together
+_EPSILON = 1e-6  # smaller weights count as zero
 
 
 class FeatureIndex:
@@ -79,7 +79,7 @@ class FeatureIndex:
         return _half_spectra(cut, self.block)[..., None]
 
     def gapless(self, blocks: Ints) -> Bools:
-        """Mask the blocks whose cells have all been surveyed, margin included."""
+        """Return a mask of the blocks whose cells are all surveyed, margin included."""
         return self._gapless[blocks]
 
     def cells_of(self, block: int | np.integer) -> tuple[slice, slice]:
@@ -102,7 +102,7 @@ class FeatureIndex:
 
     def _block_spectra(self, blocks: Ints) -> Complexes:
         out = np.empty((self.block * (self.block // 2 + 1), len(blocks), self.dimensions), dtype=np.complex64)
-        for k, block in enumerate(blocks):  # one by one: intermediate arrays stay small
+        for k, block in enumerate(blocks):  # one by one, to keep intermediate arrays small
             cut = np.ascontiguousarray(self._cut(self._features, block).transpose(1, 2, 0))
             out[:, k] = _half_spectra(cut, self.block)
         return out
@@ -123,18 +123,17 @@ def correlate(images: Floats32, index: FeatureIndex, opposite: bool, blocks: Int
 
     The mean is over surveyed cells: unsurveyed ones would count as dissimilar, and the right place at the map's edge
     would lose to a wrong one inside. A mean of few cells scatters more and would favour the rim, so a place with less
-    than :data:`MIN_COVERAGE` of the weight on surveyed cells has no score: -inf, not 0, as wrong places may score
-    below 0.
+    than :data:`MIN_COVERAGE` of the weight on surveyed cells has no score: -inf, as wrong places may score below 0.
 
     Args:
-        images: (h + 1, h + 1, K, C + 1), features times weights and the weight, as of :func:`rotate_images`.
+        images: (h + 1, h + 1, K, C + 1), features times weights and the weight, from :func:`rotate_images`.
         index: of the same cells and dimensions, with a margin of at least h / 2.
         opposite: also compare the images at the opposite headings.
         blocks: blocks of the map to score (all); see :meth:`FeatureIndex.blocks_near`.
 
     Returns:
-        (K, H, W), or (2 K, H, W): the opposite headings come last; -inf without a score. The memory's order is
-        (H, W, K): headings of a cell lie together.
+        (K, H, W), or (2 K, H, W) with the opposite headings last; -inf without a score. The memory order is (H, W, K):
+        the headings of a cell are contiguous.
 
     Raises:
         ValueError: no cell has a weight.
@@ -144,8 +143,8 @@ def correlate(images: Floats32, index: FeatureIndex, opposite: bool, blocks: Int
     if not (total > _EPSILON).all():
         raise ValueError("no cell of the query has a weight")
     spectra = _half_spectra(images * (1.0 / total)[:, None], index.block)
-    # with the first row and column of the valid part of the product; a correlation with an image rotated by 180
-    # degrees is a convolution: the same spectra, not conjugate
+    # each with the first row and column of the valid part of the product; correlation with an image rotated by 180
+    # degrees is convolution: with the same spectra, not conjugate
     queries = [(np.conjugate(spectra), index.margin - half), (spectra, index.margin + half)][: 1 + opposite]
     headings = len(queries) * turns
     chosen = np.arange(len(index)) if blocks is None else np.unique(blocks)
@@ -164,7 +163,7 @@ def _score(scores: Floats32, group: Ints, index: FeatureIndex, query: Complexes,
     gaps = np.flatnonzero(~index.gapless(group))
     if len(gaps):
         share = _inverse(index.surveyed_spectra(group[gaps]) * query[:, None, :, -1], index, first)
-        # a share equal to the minimum must not depend on how the transforms round
+        # rounding of the transforms must not decide about a share equal to the minimum
         enough = share >= MIN_COVERAGE - 1e-5
         mean[:, :, gaps] = np.where(enough, mean[:, :, gaps] / np.maximum(share, _EPSILON), -np.inf)
     for k, block in enumerate(group):
@@ -174,7 +173,7 @@ def _score(scores: Floats32, group: Ints, index: FeatureIndex, query: Complexes,
 
 def _half_spectra(images: Floats32, size: int) -> Complexes:
     """Transform images (h, w, ...), zero-padded to ``size``, to half spectra (size * (size // 2 + 1), ...)."""
-    from scipy import fft  # for the search engine only
+    from scipy import fft  # needed by the search only
 
     whole = fft.fft(fft.rfft(images, size, axis=1), size, axis=0, overwrite_x=True)
     return np.asarray(whole.reshape(-1, *images.shape[2:]))
@@ -191,7 +190,7 @@ def _inverse(product: Complexes, index: FeatureIndex, first: int) -> Floats32:
 
 
 def downsample(local: Reals, weight: Floats32 | None = None, ratio: int = 2) -> tuple[Floats32, Floats32]:
-    """Average ``ratio`` x ``ratio`` cells of features (C, H, W), each times its weight (H, W), and the weights.
+    """Average ``ratio`` x ``ratio`` cells of features (C, H, W), times their weights (H, W), and of the weights.
 
     Returns:
         (C, H / ratio, W / ratio), (H / ratio, W / ratio).
@@ -208,8 +207,8 @@ def rotate_images(images: Floats32, yaws: Floats) -> Floats32:
     """Sample rotated images on a grid of odd size about their middle.
 
     Args:
-        images: (C, h, h), h even: the middle lies between cells. Cells more than h / 2 from it are left out, as only
-            some headings would show them; outside the image is 0.
+        images: (C, h, h), h even, with the middle between cells. Cells more than h / 2 from it are left out, as only
+            some headings would show them; 0 outside the image.
         yaws: (K,) radians, counter-clockwise from x (columns) to y (rows).
 
     Returns:
@@ -230,7 +229,7 @@ def _corners(size: int, yaws: tuple[float, ...]) -> tuple[Ints, Floats32]:
     half = size // 2
     v, u = np.meshgrid(np.arange(-half, half + 1), np.arange(-half, half + 1), indexing="ij")
     c, s = np.cos(yaws), np.sin(yaws)
-    # one more cell of zeros on every side takes the values beyond the image
+    # a border of zero cells provides the values beyond the image
     col = u[..., None] * c + v[..., None] * s + (half + 0.5)
     row = v[..., None] * c - u[..., None] * s + (half + 0.5)
     inside = (np.hypot(u, v) <= half)[..., None]

@@ -1,4 +1,4 @@
-"""Feature matcher: comparison of a scan's learned features with a map's at its stations and headings."""
+"""Feature matcher: compares a scan's learned features with a map's at its stations and headings."""
 
 from __future__ import annotations
 
@@ -30,13 +30,13 @@ from coview_stream.localization.search.learned.rasters import (
 from coview_stream.localization.search.request import SearchRequest
 
 YAWS = 36
-"""Headings that are compared, an even number."""
+"""Number of compared headings, even."""
 
 _SIZE = 64.0  # metres along the edge of a query's image
 _ROUNDING = 1e-6  # cells
-_MAX_PER_PEAK = 2  # hypotheses, where stations lie above each other
-_NAMED, _NAMED_SHARE = 128, 0.01  # coarse cells that are compared finely: least number, share of all
-_TILE_RADIUS = 0.75 * TILE * LOCAL_CELL  # from a tile's middle to beyond its corners, metres
+_MAX_PER_PEAK = 2  # hypotheses per peak, where stations lie above each other
+_NAMED, _NAMED_SHARE = 128, 0.01  # coarse cells that are compared in detail: least number, share of all
+_TILE_RADIUS = 0.75 * TILE * LOCAL_CELL  # metres from a tile's middle to beyond its corners
 
 
 @dataclass(frozen=True)
@@ -55,7 +55,7 @@ class QueryFeatures:
 
     @property
     def place(self) -> Floats32:
-        """(P,) global descriptor of unit norm: the mean of the four cells in the middle."""
+        """(P,) global descriptor of unit norm: the mean of the four middle cells."""
         middle = self.features.place.shape[1] // 2
         mean = self.features.place[:, middle - 1 : middle + 1, middle - 1 : middle + 1].mean(axis=(1, 2))
         return np.asarray(mean / (np.linalg.norm(mean) + 1e-9), dtype=np.float32)
@@ -68,10 +68,10 @@ class FeatureMatcher:
     """
 
     def __init__(self, features: FeatureMap, stations: Floats32, config: LearnedConfig, *, block: float = 2.0) -> None:
-        """Search a map whose stations (M, 3) stand in the middle of blocks of ``block`` metres.
+        """Search a map whose stations (M, 3) are in the middle of blocks of ``block`` metres.
 
         Raises:
-            MapError: the features were made by other weights than the installed ones.
+            MapError: the features were computed with other weights than the installed ones.
             InputError: there are no weights.
         """
         features.check()
@@ -102,7 +102,7 @@ class FeatureMatcher:
 
     @cached_property
     def _by_coarse_cell(self) -> tuple[Ints, Ints]:
-        """Stations in the order of their coarse cells, and the first row of every cell (cells + 1,)."""
+        """Stations in the order of their coarse cells, and the first row of each cell (cells + 1,)."""
         index = self.rasters.coarse
         xy = (self.stations[:, :2].astype(np.float64) - index.corner) / index.cell
         column, row = np.floor(xy).astype(np.int64).T
@@ -113,21 +113,21 @@ class FeatureMatcher:
 
     @cached_property
     def _feature_blocks(self) -> Ints:
-        """Blocks of the index that have any features."""
+        """Blocks of the index with any features."""
         return self.rasters.coarse.blocks_near(self.features.tile_centres, _TILE_RADIUS)
 
     @property
     def dense(self) -> bool:
-        """Whether the map is small enough for a search of all cells."""
+        """Whether the map is small enough to search all cells."""
         return self.features.tile_area <= self.config.dense_area
 
     def prepare(self) -> None:
-        """Load the network and compute the map's spectra, which the first query would do otherwise.
+        """Load the network and compute the map's spectra ahead of the first query.
 
         Raises:
             InputError: the weights cannot be loaded.
         """
-        import scipy.ndimage  # noqa: F401  # a quarter of a second, which the first image would take
+        import scipy.ndimage  # noqa: F401  # takes a quarter of a second, otherwise at the first image
 
         warm_up("height_columns", "window_products")
         _ = self.network, self._feature_blocks if self.dense else self.rasters, self.cells, self._by_coarse_cell
@@ -167,7 +167,7 @@ class FeatureMatcher:
     def _named(self, coarse: Floats32, turned: TurnedQuery) -> tuple[tuple[Ints, Ints], Ints]:
         """Return stations and shifts (N,) in and around the best coarse cells and headings (2 K, H, W).
 
-        A cell counts with its best heading of either half turn. The second array (N,) numbers cells and half turns.
+        A cell counts once per half turn, with its best heading. The second array (N,) numbers cells and half turns.
         """
         order, begin = self._by_coarse_cell
         halves = coarse.reshape(2, len(turned.headings), -1)
@@ -223,7 +223,7 @@ class LearnedRecognizer:
         self.consensus.vote(self.learned.vote(query, hinted, request.area))
 
     def hypotheses(self) -> list[Hypothesis]:
-        """Return the consensus' peaks on all storeys below and above them: from above these look alike."""
+        """Return the consensus' peaks on all storeys below and above them, which look alike from above."""
         grid, peaks = self.consensus.grid, self.consensus.hypotheses()
         places: dict[tuple[int | None, int | None], Hypothesis] = {}
         own = np.array([peak.station for peak in peaks], dtype=np.int64)

@@ -1,7 +1,7 @@
 """Feature rasters: a map's features in their principal dimensions, fine and coarse, and votes of queries on them.
 
 The score of a station and shift is the weighted mean inner product of a query's features with the map's over the
-surveyed cells. Where less than ``MIN_COVERAGE`` of the weight is compared there is no score, as the mean of few cells
+surveyed cells. With less than ``MIN_COVERAGE`` of the weight compared there is no score, as a mean of few cells
 scatters.
 """
 
@@ -18,14 +18,14 @@ from coview_stream.geometry.arrays import Floats, Floats32, Ints
 from coview_stream.localization.search.learned.correlation import MIN_COVERAGE, FeatureIndex, downsample, rotate_images
 
 WEIGHT = 7
-"""Dimension, of the eight of a cell, that holds the query's weight, and whether the map has the cell."""
+"""The last of a cell's eight dimensions: the query's weight, or whether the map has the cell."""
 
-_SAMPLE = 1024  # scores from which median and MAD are estimated, good to 4 %
-_STRIDE = 7  # shifts between two of them
+_SAMPLE = 1024  # scores for the estimate of median and MAD, to 4 %
+_STRIDE = 7  # shifts between two samples
 _ENERGY = 0.995  # share of the features' energy in the principal dimensions
-_TILES = 64  # from which the principal dimensions are computed
+_TILES = 64  # sampled for the principal dimensions
 _COARSE = 2  # fine cells along the edge of a coarse one
-_BLOCK = 6  # edge of a coarse block over its margin: two thirds of it are valid
+_BLOCK = 6  # ratio of a coarse block's edge to its margin: two thirds are valid
 _BYTE = 127.0
 
 
@@ -67,11 +67,11 @@ class FeatureVote:
 
         Args:
             centre: see the attribute.
-            raster: the map's features and mask of cells, its margin half an image.
+            raster: the map's features and mask of cells, with a margin of half an image.
             cells: of the stations.
             images: the query's features and weight at all shifts.
             candidates: stations and shifts (N,).
-            groups: (N,) group numbers; only the best of a group stays a candidate.
+            groups: (N,) group numbers; only the best of each group remains a candidate.
         """
         self.centre = centre
         self._images = images
@@ -79,7 +79,7 @@ class FeatureVote:
         self._cells = cells
         self._half = images.side // 2
         self._total = np.maximum(images.images[..., WEIGHT].sum(axis=(1, 2), dtype=np.int64), 1) * 127.0
-        # median and robust standard deviation of the scores, from stations and shifts spread evenly
+        # median and robust standard deviation of the scores, from an even sample of stations and shifts
         number = np.arange(min(_SAMPLE, len(cells) * self.sectors))
         sample = self.scores(number * len(cells) // max(len(number), 1), number * _STRIDE % self.sectors)
         sample = sample[np.isfinite(sample)]
@@ -151,7 +151,7 @@ class FeatureRasters:
         cell: edge of a fine cell, metres.
         shape: fine rows and columns.
         fine: features times 127; the last dimension is 127 in cells with features.
-        coarse: means of the features over cells twice as large, with their spectra.
+        coarse: mean features over cells twice as large, with their spectra.
     """
 
     axes: Floats32
@@ -200,8 +200,8 @@ def turn_query(local: Floats32, weight: Floats32, rasters: FeatureRasters, ratio
         local: (C, H, W) features.
         weight: (H, W) of the cells.
         rasters: of the map.
-        ratio: number of query cells along the edge of a fine cell of the map.
-        yaws: (S,) even in number; the second half is opposite to the first.
+        ratio: number of query cells along the edge of a fine map cell.
+        yaws: (S,) an even number; the second half is opposite to the first.
     """
     reduced, shares = downsample(np.tensordot(rasters.axes, local, 1), weight, ratio)
     half = len(yaws) // 2
@@ -216,7 +216,7 @@ def turn_query(local: Floats32, weight: Floats32, rasters: FeatureRasters, ratio
 
 
 def _bytes(values: Floats32) -> Floats32:
-    """Round to the range of a signed byte, which rounded features of norm 1 may exceed."""
+    """Round to the range of a signed byte, which features of norm 1 may exceed by rounding."""
     return np.rint(np.clip(values, -_BYTE, _BYTE))
 
 
@@ -228,11 +228,11 @@ def _pooled(values: Floats32) -> Floats32:
 
 
 def _halved(images: Floats32) -> Floats32:
-    """Add up images (h, h, ...), h odd, in cells twice as large about the same middle cell's centre."""
+    """Add up images (h, h, ...), h odd, in cells twice as large, with the same central point."""
     out = images
     for axis in (0, 1):
         padded = np.moveaxis(out, axis, 0)
-        if len(padded) // 2 % 2:  # the middle stays in the middle of a coarse cell
+        if len(padded) // 2 % 2:  # keep the middle in the middle of a coarse cell
             padded = np.pad(padded, [(1, 1)] + [(0, 0)] * (padded.ndim - 1))
         between = 0.5 * padded[1::2]
         coarse = padded[::2].copy()
@@ -243,9 +243,9 @@ def _halved(images: Floats32) -> Floats32:
 
 
 def principal_axes(vectors: Floats32, energy: float, most: int) -> Floats32:
-    """Return the fewest orthonormal directions (D, C) with the share ``energy`` of vectors (C, N), best first.
+    """Return the fewest orthonormal directions (D, C), at most ``most``, with the share ``energy`` of vectors (C, N).
 
-    They leave out ``1 - energy`` of the squares of the vectors in the mean. ``most`` limits their number.
+    They omit ``1 - energy`` of the vectors' mean square. The best come first.
     """
     values, directions = np.linalg.eigh((vectors @ vectors.T).astype(np.float64))
     share = np.cumsum(values[::-1]) / max(float(values.sum()), 1e-30)
