@@ -1,1 +1,1 @@
-"""Tracking: registrations to the map and odometry between them, in one graph of poses."""
+"""Tracking: registrations to the map and odometry between them, in one pose graph."""

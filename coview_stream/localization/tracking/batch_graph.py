@@ -1,17 +1,16 @@
-"""Pose graph offline: any constraints between poses and to the map, solved at once.
+"""Offline pose graph: any constraints between poses and to the map, solved at once.
 
-The unknowns are poses X_k. With e(A, B) = log(A^-1 B) and the covariance C of a constraint, they minimise the sum of
+The unknowns are poses X_k. With e(A, B) = log(A^-1 B) and a constraint's covariance C, they minimise the sum of
 
     rho(|C^-1/2 e(Z, X_target^-1 X_source)|)        X_target = I for the map
 
-with rho(d) = d^2 / 2, Huber's or Cauchy's. The method of Levenberg and Marquardt solves (H + l diag H) xi = -g and
-takes the poses to X_k exp(xi_k) if the sum falls. H and g have the weights rho'(d) / d of iteratively reweighted least
-squares.
+with rho(d) = d^2 / 2, Huber's or Cauchy's. Levenberg-Marquardt solves (H + l diag H) xi = -g and moves the poses to
+X_k exp(xi_k) if the sum falls. H and g have the weights rho'(d) / d of iteratively reweighted least squares.
 
-H is factored by blocks of a pose, L D L^T: poses are eliminated in order of their fewest neighbours, as they then are,
-which couples these neighbours (Dellaert and Kaess, "Factor graphs for robot perception", 2017, chapter 3). A chain
-takes time in proportion to its length. The same blocks give the covariances, the last pose's first (Takahashi, Fagan
-and Chin, 1973): with the neighbours U of pose k, W_k = D_k^-1 H_kU and S = H^-1,
+H is factored by pose blocks, L D L^T. The pose with the fewest neighbours is eliminated first, which couples these
+neighbours (Dellaert and Kaess, "Factor graphs for robot perception", 2017, chapter 3). A chain takes time proportional
+to its length. The same blocks give the covariances, starting with the last pose (Takahashi, Fagan and Chin, 1973): with
+the neighbours U of pose k, W_k = D_k^-1 H_kU and S = H^-1,
 
     S_kU = -W_k S_UU        S_kk = D_k^-1 - W_k S_Uk
 """
@@ -29,9 +28,9 @@ import numpy as np
 from coview_stream.geometry.arrays import Floats, Ints
 from coview_stream.geometry.transforms import Pose, Poses, adjoint, log_se3, moved, relative
 
-_SETTLED = 1e-7  # metres and radians of the last step
+_SETTLED = 1e-7  # metres and radians of the last step, at most
 _MAX_STEPS = 100
-_DAMPING = 1e-9, 1e3  # first and largest share of the diagonal: ten times less after a step that helps, else more
+_DAMPING = 1e-9, 1e3  # first and largest share of the diagonal; divided by ten after a step that helps, else multiplied
 
 
 @dataclass(frozen=True, eq=False)
@@ -39,9 +38,9 @@ class Constraint:
     """Measured pose of one node of a graph, on the map or relative to another node."""
 
     source: int  # index of the measured node
-    target: int  # index of the node that it is measured from; -1: the map
+    target: int  # index of the node from which it is measured; -1 for the map
     T: Pose  # (4, 4) pose of the source's body, relative to the target's body or to the map's origin
-    covariance: Floats  # (6, 6) of it over (rx, ry, rz, x, y, z), along the axes of the source's body
+    covariance: Floats  # (6, 6) over (rx, ry, rz, x, y, z), along the axes of the source's body
 
 
 class _Linear(NamedTuple):
@@ -56,11 +55,11 @@ class _Linear(NamedTuple):
 class BatchGraph:
     """Graph of any constraints: the most probable poses, and the covariance of each.
 
-    Each connected part of it needs a constraint to the map.
+    Every connected part needs a constraint to the map.
     """
 
     def __init__(self, poses: Poses) -> None:
-        """Begin at poses (N, 4, 4) of the nodes."""
+        """Start from poses (N, 4, 4) of the nodes."""
         self._poses = np.asarray(poses, dtype=np.float64).reshape(-1, 4, 4)
         self._constraints: list[Constraint] = []
         self._kernels: list[tuple[slice, tuple[str, float]]] = []
@@ -112,7 +111,7 @@ class BatchGraph:
         return _Linear(float(rho.sum()), nodes, pairs, g)
 
     def _loss(self, squared: Floats) -> tuple[Floats, Floats]:
-        """Return rho (M,) and the weights (M,), of squared residuals (M,) in sigmas."""
+        """Return rho (M,) and the weights (M,) of squared residuals (M,) in sigmas."""
         rho, weights = 0.5 * squared, np.ones_like(squared)
         for part, (kind, width) in self._kernels:
             share = squared[part] / width**2
@@ -125,7 +124,7 @@ class BatchGraph:
 
 
 class _Eliminated(NamedTuple):
-    """A node, and those that it is coupled to when it is eliminated."""
+    """A node, and the nodes to which it is coupled at its elimination."""
 
     node: int
     others: Ints  # (m,) in order of their own elimination
@@ -134,7 +133,7 @@ class _Eliminated(NamedTuple):
 
 
 class _Structure:
-    """The part of a graph that depends on no pose: its constraints as arrays, and the order of elimination."""
+    """The part of a graph that is independent of the poses: constraints as arrays, and the elimination order."""
 
     def __init__(self, count: int, constraints: Sequence[Constraint]) -> None:
         self.source = np.array([c.source for c in constraints], dtype=np.int64)  # (M,)
@@ -150,7 +149,7 @@ class _Structure:
                 beside[b].add(a)
         heap = [(len(others), k) for k, others in enumerate(beside)]
         heapq.heapify(heap)
-        place: dict[int, int] = {}  # in the order of elimination
+        place: dict[int, int] = {}  # position in the elimination order
         while heap:
             neighbours, k = heapq.heappop(heap)
             if k not in place and neighbours == len(beside[k]):
@@ -174,7 +173,7 @@ class _Structure:
 
 
 class _Factor:
-    """H, factored by blocks: of each eliminated node D^-1 (6, 6) and W = D^-1 H_kU (6, 6 m)."""
+    """H, factored by blocks: for each eliminated node D^-1 (6, 6) and W = D^-1 H_kU (6, 6 m)."""
 
     def __init__(self, structure: _Structure, linear: _Linear, damping: float) -> None:
         self.order, self._parts = structure.order, list[tuple[Floats, Floats]]()

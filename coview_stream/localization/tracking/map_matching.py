@@ -1,4 +1,4 @@
-"""Matching to the map while tracking: one scan registered from a belief about its pose, verified and judged."""
+"""Matching to the map while tracking: a scan is registered from a belief about its pose, verified and judged."""
 
 from __future__ import annotations
 
@@ -27,19 +27,19 @@ from coview_stream.localization.tracking.place_evidence import Observation, Plac
 from coview_stream.localization.tracking.pose_graph import Estimate
 from coview_stream.localization.tracking.slip import Dispute, matters, off_by
 
-_RINGS = ((0.9, 6), (1.7, 10), (2.5, 14), (3.3, 18))  # metres, poses; each is moved to the best within 0.4 m
-_STRAIGHT, _TURNED = (0.0,), (-0.07, 0.0, 0.07)  # radians, of their headings
-_WIDEST = 1.0  # metres: coarser scales are left out, as the poses are the best near them
-_EVERY = 3  # of the scan's points are registered
-_MAX_RIVALS = 2  # searched for in a doubtful match
+_RINGS = ((0.9, 6), (1.7, 10), (2.5, 14), (3.3, 18))  # metres, poses; each moves to the best within 0.4 m
+_STRAIGHT, _TURNED = (0.0,), (-0.07, 0.0, 0.07)  # radians, turns of these poses
+_WIDEST = 1.0  # metres; the poses are locally best, so coarser scales are left out
+_EVERY = 3  # every third point is registered
+_MAX_RIVALS = 2  # of a doubtful match
 
 
 @dataclass(frozen=True)
 class Rival:
-    """A probable pose beside a registered one."""
+    """A probable pose other than a registered one."""
 
     T_map_odom: Pose  # (4, 4) as registered there
-    ratio: float  # log-likelihood ratio of the scan there, against chance around the other
+    ratio: float  # log-likelihood ratio of the scan there against chance around the registered pose
 
 
 def find_rivals(
@@ -50,11 +50,11 @@ def find_rivals(
     config: RegistrationConfig,
     count: int = 1,
 ) -> list[Rival]:
-    """Return the most probable poses beside a registered one that do not converge to it; perhaps none.
+    """Return the most probable poses around a registered one that do not converge to it; perhaps none.
 
     After a slip, registration starts beside the right place, and a wall moved since the survey may hold it there. So
-    the map is looked up on rings of poses around, and the ``count`` most probable ones are registered, too: a place has
-    to explain the scan better than its best rival. A count above 1 also tries other headings.
+    the scan is compared with the map on rings of poses around, and the ``count`` most probable ones are registered,
+    too: a place has to explain the scan better than its best rival. A count above 1 also tries other headings.
     """
     here = scan.poses(T_map_odom[None])[0]
     poses, ratios = place.look_around(scan, T_map_odom, rings(here, _TURNED if count > 1 else _STRAIGHT))
@@ -78,14 +78,14 @@ def find_rivals(
 
 
 def _beside(scan: ObservedScan, T_map_odom: Pose, T_map_other: Pose) -> bool:
-    """Return whether two poses of a scan differ by too much on the ground, where wheels slip."""
+    """Return whether two poses of a scan differ too much in the plane, where wheels slip."""
     along, other = T_map_odom @ scan.T_odom_body, T_map_other @ scan.T_odom_body
     along[2, 3] = other[2, 3]
     return matters(*off_by(along, other))
 
 
 def rings(pose: Floats, turns: tuple[float, ...]) -> Floats:
-    """Return poses (H, 4), x, y, z and heading, in rings around one (4,), each with all the turns."""
+    """Return poses (H, 4), x, y, z and heading, in rings around a pose (4,), each with all ``turns``."""
     radius = np.concatenate([np.full(count, metres) for metres, count in _RINGS])
     angle = np.concatenate([2.0 * np.pi * np.arange(count) / count for _, count in _RINGS])
     around = np.column_stack([radius * np.cos(angle), radius * np.sin(angle), np.zeros((len(radius), 2))])
@@ -94,21 +94,21 @@ def rings(pose: Floats, turns: tuple[float, ...]) -> Floats:
 
 @dataclass(frozen=True)
 class MapMatch:
-    """Registration while tracking: more than an :class:`Estimate`, as its verdict decides its use."""
+    """Registration while tracking, with the verdict that decides its use."""
 
     verdict: MatchVerdict  # the decision and its reason
-    T_map_body: Pose  # (4, 4) with the prior removed
-    covariance: Floats  # (6, 6) as of an Estimate
+    T_map_body: Pose  # (4, 4) without the prior
+    covariance: Floats  # (6, 6) as in an Estimate
     innovation: float = 0.0  # squared Mahalanobis distance from the graph's prediction
     scan: ObservedScan | None = None  # the registered scan; None if registration failed
     target: LocalMap | None = None  # the map around it; None likewise
-    rivals: tuple[Rival, ...] = ()  # poses metres beside it, the most probable first, if they were searched for
-    moves_place: bool = False  # it contradicts odometry, and is believed instead
-    confirms_search: bool = False  # it is the first at an accepted place and adds no evidence to the search's
+    rivals: tuple[Rival, ...] = ()  # other poses metres away, most probable first, if searched for
+    moves_place: bool = False  # it contradicts odometry and is believed instead
+    confirms_search: bool = False  # first match at an accepted place, which adds no evidence to the search's
 
     @classmethod
     def without_registration(cls, verdict: MatchVerdict, belief: Estimate) -> MapMatch:
-        """Return the match of a scan that could not be registered: the belief stays."""
+        """Return the match of a scan that could not be registered, with the belief unchanged."""
         return cls(verdict, belief.T_map_body, belief.covariance)
 
 
@@ -117,7 +117,7 @@ class MapMatcher:
 
     Attributes:
         place: evidence of the tracked place, against chance.
-        dispute: evidence of the possible places while odometry is contradicted.
+        dispute: evidence of the possible places while the scans contradict odometry.
         baseline: usual evidence, for reasons in words.
     """
 
@@ -129,7 +129,7 @@ class MapMatcher:
         self.baseline = EvidenceBaseline()
 
     def clear(self) -> None:
-        """Forget the usual shares: the place is another."""
+        """Forget the usual shares of the previous place."""
         self.place.clear()
         self.baseline.usual = None
 
@@ -142,7 +142,7 @@ class MapMatcher:
         predicted: Estimate,
         rivals_wanted: int = 1,
     ) -> MapMatch:
-        """Register from ``belief``, which is the prior (eq. 13), verify and judge; without a registration it stays.
+        """Register from ``belief``, which is the prior (eq. 13) and stays if that fails; verify and judge.
 
         ``predicted`` is the graph's estimate, for the innovation; ``rivals_wanted`` limits the search for rivals.
         """
@@ -180,7 +180,7 @@ class MapMatcher:
     def match_widely(
         self, first: MapMatch, scan: ObservedScan, belief: Estimate, target: LocalMap, predicted: Estimate
     ) -> list[MapMatch]:
-        """Match again, from a belief wide enough for a slip and from the best rival; compare these with ``first``.
+        """Match again, from a belief wide enough for a slip and from the best rival; compare them with ``first``.
 
         Returns ``first`` and one or two more.
         """
@@ -204,12 +204,12 @@ class MapMatcher:
         belief: Estimate,
         travelled: float,
     ) -> MapMatch:
-        """Judge the best of ``tries``, which fits, but contradicts odometry: the place moves if the scans support it.
+        """Judge the best of ``tries``, which fits but contradicts odometry: the place moves if the scans support that.
 
-        If the two places are near enough for either to be right, the lidar's is believed, without a pose until the next
-        frame agrees. Within odometry's drift there is no contradiction. If the headings alone differ, odometry is
-        wrong, as moved objects do not turn about the robot. If the heights differ by more than the drift, odometry is
-        right, as no wheel slips upwards. ``T_map_predicted`` (4, 4) is by odometry, or by a match that agrees with it;
+        If the two places are near enough for either to be right, the lidar is believed, without a pose until the next
+        frame agrees. Within odometry's drift there is no contradiction. If only the headings differ, odometry is wrong,
+        as moved objects do not turn about the robot. If the heights differ by more than the drift, odometry is right,
+        as no wheel slips upwards. ``T_map_predicted`` (4, 4) is by odometry, or by a match that agrees with it;
         ``belief`` is odometry's.
         """
         rule = self._config.acceptance
@@ -219,12 +219,12 @@ class MapMatcher:
             return match
         gap = match.T_map_body[:3, 3] - T_map_predicted[:3, 3]
         spread = belief.covariance[3:, 3:] + match.covariance[3:, 3:]
-        rare = chi2_tail(6, rule.max_innovation)  # probability beyond which nothing is plausible
+        rare = chi2_tail(6, rule.max_innovation)  # probability below which nothing is plausible
         here = not matters(metres, 0.0) and float(gap @ np.linalg.solve(spread, gap)) <= chi2_quantile(3, rare)
         if here and not matters(0.0, degrees):
             return replace(match, moves_place=True)
         level = gap[2] ** 2 <= chi2_quantile(1, rare) * spread[2, 2]
-        moves = here or (level and not matters(metres, degrees))  # here, but turned; or so near that it does not matter
+        moves = here or (level and not matters(metres, degrees))  # here, but turned; or close enough
         if not moves:
             places = [other.T_map_body for other in tries if other.scan is not None]
             places += [rival.T_map_odom @ scan.T_odom_body for other in tries for rival in other.rivals]
@@ -241,7 +241,7 @@ class MapMatcher:
         return replace(match, verdict=verdict, moves_place=moves)
 
     def _against(self, match: MapMatch, others: list[MapMatch]) -> MapMatch:
-        """Hold a match against those of the same scan that ended elsewhere."""
+        """Compare a match with those of the same scan that ended elsewhere."""
         verdict = match.verdict
         observation, evidence = verdict.observation, verdict.evidence
         if observation is None or evidence is None or match.scan is None:
@@ -260,7 +260,7 @@ class MapMatcher:
         return replace(match, verdict=verdict)
 
     def _judge(self, observation: Observation, evidence: Evidence) -> tuple[RejectionReason, str]:
-        """Judge a scan at a pose: a cause, and a clause."""
+        """Judge a scan at a pose; return a cause and a clause."""
         if observation.against_elsewhere > 0.0:
             return RejectionReason.VERIFIED, "verified"
         if observation.ratio > 0.0:

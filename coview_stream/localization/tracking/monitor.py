@@ -1,8 +1,8 @@
 """Loss monitor: the probability while tracking that the robot is elsewhere, and its consequences.
 
-Two hypotheses are compared: the robot is at the tracked place, or it is not (odometry has jumped, it has been carried,
-the place was wrong from the beginning). A registration weighs them by its log-likelihood ratio
-(:mod:`coview_stream.localization.tracking.place_evidence`); driving makes the second a little more probable. Poses are
+Two hypotheses are compared: the robot is at the tracked place, or it is not (odometry jumped, the robot was carried,
+the place was wrong from the start). A registration weighs them by its log-likelihood ratio
+(:mod:`coview_stream.localization.tracking.place_evidence`); driving makes the second slightly more probable. Poses are
 reported while its probability is below the integrity risk; above one half the place is lost, which takes two views, as
 a scan may show nothing of the right place. docs/integrity.md has the equations.
 """
@@ -24,16 +24,16 @@ from coview_stream.localization.tracking.place_evidence import Observation
 
 # prior probabilities that a place becomes wrong; set by hand
 PER_METRE = 1e-5  # once in 100 km odometry jumps, or the robot is displaced
-_PER_SECOND = 1e-4  # in doubt: a blind robot may be on its way elsewhere
+_PER_SECOND = 1e-4  # in doubt: a blind robot may be driving elsewhere
 _UNSEEN = 5e-4  # while the robot was out of contact
-_NOTHING = 1e-3  # probability that a scan shows nothing of the right place: a lorry in front of it, garbage
-_NO_SCORE = 1e-6  # a share of nothing: levels of kilometres
-_OFF_MAP = 0.3  # share of the scan on the map below which the reason says so; decides nothing
-_NEWEST_SHARE = 0.2  # weight of new shares in the usual ones: about the last five registrations
+_NOTHING = 1e-3  # probability that a scan shows nothing of the right place: a lorry hides it, garbage
+_NO_SCORE = 1e-6  # least score, which gives levels of kilometres
+_OFF_MAP = 0.3  # share of the scan on the map below which the reason mentions it; decides nothing
+_NEWEST_SHARE = 0.2  # weight of new shares in the usual ones: averages about five registrations
 
 
 class RejectionReason(StrEnum):
-    """Reason of a verdict on a registration while tracking; docs/reasons.md has the remedies."""
+    """Cause of a verdict on a registration while tracking; docs/reasons.md has the remedies."""
 
     VERIFIED = "verified"
     """Nothing speaks against the place."""
@@ -50,7 +50,7 @@ class RejectionReason(StrEnum):
     FREE_SPACE = "free-space"
     """Rays passed through structure of the map."""
     ODOMETRY = "odometry"
-    """The place fits, but not where odometry says that the robot has moved."""
+    """The place fits, but contradicts the motion by odometry."""
     CONVENTIONS = "conventions"
     """Clouds or odometry come in other units or axes."""
     REPEATED = "repeated"
@@ -62,7 +62,7 @@ class RejectionReason(StrEnum):
     MOUNT = "mount"
     """The sensor was turned or shifted on its mount, or clouds come in another frame."""
     MIXED = "mixed"
-    """Clouds of more than one place come in turns, or in one."""
+    """Clouds of several places come in turns, or within one cloud."""
 
 
 FAULTS = (
@@ -75,12 +75,12 @@ _AT_ONCE = (
     RejectionReason.BLIND, RejectionReason.ODOMETRY, RejectionReason.TILT, RejectionReason.REPEATED,
     RejectionReason.CLOCK, RejectionReason.MOUNT, RejectionReason.MIXED, RejectionReason.STOPPED,
 )  # fmt: skip
-"""Causes that stop the poses at once, though they are no evidence of a wrong place."""
+"""Causes that stop poses at once, though they are no evidence of a wrong place."""
 
 
 @dataclass(frozen=True)
 class MatchVerdict:
-    """Verdict on one registration; only ``cause`` and ``reason`` without one."""
+    """Verdict on one registration; without one only ``cause`` and ``reason``."""
 
     cause: RejectionReason  # of the decision
     reason: str  # one clause for people
@@ -110,7 +110,7 @@ class EvidenceBaseline:
     usual: Evidence | None = None  # running average; None before the first registration
 
     def learn(self, evidence: Evidence) -> None:
-        """Add the evidence of a registration that was believed."""
+        """Add the evidence of a believed registration."""
         if self.usual is None:
             self.usual = evidence
             return
@@ -122,7 +122,7 @@ class EvidenceBaseline:
         return 1.0 if self.usual is None else max(1.0, self.usual.score / max(evidence.score, _NO_SCORE))
 
     def explain(self, evidence: Evidence) -> tuple[RejectionReason, str]:
-        """Return the cause of poor evidence, the share that has fallen furthest below the usual one, and a clause."""
+        """Return the cause of poor evidence, which is the share furthest below its usual value, and a clause."""
         usual = self.usual or Evidence(0.0, 0.0, 0.0, 0.0, 0.0)
         structure = evidence.near * evidence.covered / (usual.near * usual.covered or 0.25)
         ground = evidence.ground / (usual.ground or 1.0)
@@ -142,10 +142,10 @@ class EvidenceBaseline:
 
 
 class Ruling(NamedTuple):
-    """Consequence of a registration for the place, after the earlier ones."""
+    """Consequence of a registration for the place, given the earlier ones."""
 
     event: Event | None
-    """For the robot's state; None: nothing."""
+    """For the robot's state; None for no change."""
     reason: str
     """One clause."""
     wrong: float
@@ -155,11 +155,11 @@ class Ruling(NamedTuple):
 
 
 class LossMonitor:
-    """Odds that the place is wrong, from registration to registration.
+    """Odds that the place is wrong, updated by each registration.
 
     Evidence against the place adds up by views: of registrations within ``TrackingConfig.distance`` the newest counts.
-    Evidence for the place does not add up, as a place that fits by chance goes on to fit: one view has to outweigh all
-    evidence against it.
+    Evidence for the place does not add up, as a place that fits by chance continues to fit: one view has to outweigh
+    all evidence against it.
     """
 
     def __init__(self, rule: AcceptanceConfig, tracking: TrackingConfig) -> None:
@@ -168,16 +168,16 @@ class LossMonitor:
         self.begin(0.0)
 
     def begin(self, error: float) -> None:
-        """Begin at a place that is wrong with a probability of ``error``."""
-        self._odds = self._before = error / (1.0 - error)  # now, and before the present view
-        self._viewed_at = -math.inf  # metres driven where the view began
+        """Start at a place that is wrong with probability ``error``."""
+        self._odds = self._before = error / (1.0 - error)  # now, and before the current view
+        self._viewed_at = -math.inf  # metres driven at the start of the view
         self._newest: tuple[float, float] | None = None  # stamp and metres driven, of the newest registration
         self._since: float | None = None  # stamp of the first doubted registration
-        self._seen_since = 0.0  # stamp of the first doubted one that was not blind
+        self._seen_since = 0.0  # stamp of the first doubted registration that was not blind
         self._required = False  # whether a registration has to be believed before the next pose
 
     def require_verification(self) -> None:
-        """Begin a doubt: the robot may have been carried unseen."""
+        """Start a doubt, as the robot may have been carried unseen."""
         if not self._required:
             self._required = True
             self._before, self._odds = self._before + _UNSEEN, self._odds + _UNSEEN
@@ -187,7 +187,7 @@ class LossMonitor:
         waited, driven = (0.0, 0.0) if self._newest is None else (stamp - self._newest[0], travelled - self._newest[1])
         self._newest = stamp, travelled
         prior = PER_METRE * max(driven, 0.0) + _PER_SECOND * max(waited, 0.0) * (self._since is not None)
-        # standing and fitting again and again is no certainty: at any view the place may have become wrong
+        # repeated fits of a standing robot are no certainty: at any view the place may have become wrong
         self._before = max(self._before + prior, PER_METRE * self._tracking.distance)
         self._odds += prior
         if verdict.observation is not None:
@@ -210,7 +210,7 @@ class LossMonitor:
         return self._doubt(verdict, stamp, wrong)
 
     def _doubt(self, verdict: MatchVerdict, stamp: float, wrong: float) -> Ruling:
-        """Stop the poses; after a while give the place up."""
+        """Stop the poses; after some time give up the place."""
         if self._since is None:
             self._since = self._seen_since = stamp
         blind = verdict.cause is RejectionReason.BLIND

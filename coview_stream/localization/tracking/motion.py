@@ -1,7 +1,7 @@
-"""Motion while tracking: distance and drift of odometry, and the newest frames' points.
+"""Motion while tracking: distance and drift of odometry, and the points of the newest frames.
 
 A wheeled robot on asphalt drifts by half a per cent, one on gravel by five. So the rates are measured while tracking:
-the motion between two registrations less odometry's is its drift plus the noise of both registrations.
+the motion between two registrations minus odometry's is its drift plus the noise of both registrations.
 """
 
 from __future__ import annotations
@@ -21,24 +21,24 @@ from coview_stream.localization.calibration.odometry_history import Moment
 from coview_stream.localization.registration.register import propagate, swap_rotation_translation
 
 MAX_FRAMES = 40
-"""Frames whose points are held."""
-_OWN_NOISE = 0.4  # independent share of two neighbouring registrations' variances, measured once on simulated drives
+"""Frames whose points are kept."""
+_OWN_NOISE = 0.4  # independent share of successive registrations' variances, measured once on simulated drives
 _FLAT = [3, 4, 2]  # x, y and heading of (rx, ry, rz, x, y, z)
 _GROUPS = ((0, 1), (2,), (3, 4), (5,))  # of (rx, ry, rz, x, y, z): tilt, yaw, position, height
 _MIN_FACTOR = 0.3  # of the configured rates
-_MAX_FACTOR = 20.0  # likewise: a scale error is no random walk, and looks like a high rate
+_MAX_FACTOR = 20.0  # likewise; a scale error is no random walk, but looks like a high rate
 _MEMORY = 40.0  # metres over which measured drift is forgotten
-_OUTLIER = 16.0  # variances; a larger slip counts as this, as rates should grow step by step
-_MIN_STEP = 0.2  # metres; over less, the registrations' noise hides the drift
+_OUTLIER = 16.0  # variances; limit for larger slips, as rates should grow step by step
+_MIN_STEP = 0.2  # metres; on shorter steps the registrations' noise hides the drift
 _MIN_TURN = float(np.radians(5.0))  # likewise
-_TREMBLE = float(np.radians(0.03))  # of odometry's roll and pitch, before it is measured
-_TREMBLE_COUNT, _MAX_COUNT = 5.0, 40.0  # registrations that this counts as, and that are remembered
+_TREMBLE = float(np.radians(0.03))  # jitter of odometry's roll and pitch, before it is measured
+_TREMBLE_COUNT, _MAX_COUNT = 5.0, 40.0  # weight of this value in registrations, and memory of the estimate
 _MIN_DRIVEN = 1e-3  # metres: keeps the covariance positive definite when standing still
 
 
 @dataclass(frozen=True)
 class Drift:
-    """Sigmas of odometry's errors, of a random walk: metres and radians per square root of a metre driven."""
+    """Sigmas of the random walk of odometry's errors: metres and radians per square root of a metre driven."""
 
     position: float  # each of x and y
     height: float
@@ -88,22 +88,23 @@ class DriftEstimator:
 
     @property
     def tremble(self) -> Floats:
-        """Covariance (6, 6) over (rx, ry, rz, x, y, z) of the tilt of a frame beside its neighbours, map axes.
+        """Covariance (6, 6) over (rx, ry, rz, x, y, z), map axes, of a frame's tilt relative to neighbouring frames.
 
-        Roll and pitch of odometry tremble from frame to frame, and so do those of registrations: each has half of the
-        mean square by which the two disagree from one registration to the next.
+        Roll and pitch of odometry jitter from frame to frame, and so do those of registrations. Each is assigned half
+        of the mean square of their disagreement between successive registrations.
         """
         return np.diag([self._tilt, self._tilt, 0.0, 0.0, 0.0, 0.0])
 
     def add(self, gap: Floats, noise: Floats, driven: float, turned: float) -> None:
         """Add the motion between two registrations, where it is :func:`worth_learning`.
 
-        ``gap`` (6,) over (rx, ry, rz, x, y, z) is the later pose less odometry's prediction from the earlier one,
-        ``noise`` (6,) the variances of the two registrations alone; metres ``driven`` and radians ``turned`` between.
+        ``gap`` (6,) over (rx, ry, rz, x, y, z) is the later pose minus odometry's prediction from the earlier one,
+        ``noise`` (6,) the variances of the two registrations alone, with metres ``driven`` and radians ``turned``
+        between.
         """
         nominal = self._nominal.variances(driven, turned)
         now = self.drift.variances(driven, turned)
-        # negative ones stay, as their mean would be biased
+        # keep negative ones, as their mean would be biased
         squares = np.minimum(gap**2, _OUTLIER * (now + noise))
         self._count = min(self._count + 1.0, _MAX_COUNT)
         self._tilt += (float(squares[:2].mean()) / 2.0 - self._tilt) / self._count
@@ -111,7 +112,7 @@ class DriftEstimator:
         for group, axes in enumerate(_GROUPS):
             rows = list(axes)
             if driven < _MIN_STEP and rows != [2]:
-                continue  # turning on the spot informs the heading alone
+                continue  # turning on the spot informs only the heading
             # for the heading, a turn on the spot counts as metres of driving
             metres = float(nominal[rows[0]] / self._nominal.variances(1.0, 0.0)[rows[0]])
             # a registration with a large variance in a direction hardly informs its drift
@@ -123,7 +124,7 @@ class DriftEstimator:
 
 
 def worth_learning(driven: float, turned: float) -> bool:
-    """Return whether a motion of so many metres and radians is long enough to measure drift."""
+    """Return whether a motion by these metres and radians is long enough to measure drift."""
     return driven >= _MIN_STEP or turned >= _MIN_TURN
 
 
@@ -147,7 +148,7 @@ class _Registered:
 
 
 class OdometryTracker:
-    """Metres and radians of odometry, altogether and since the newest keyframe, and its drift as measured.
+    """Distance and rotation of odometry, in total and since the newest keyframe, and its measured drift.
 
     Attributes:
         travelled: metres driven.
@@ -155,7 +156,7 @@ class OdometryTracker:
     """
 
     def __init__(self, config: TrackingConfig, calibration: CalibrationEstimator) -> None:
-        """Begin with the configured rates; ``calibration`` learns the systematic part."""
+        """Start with the configured rates; ``calibration`` learns the systematic part."""
         self.travelled = 0.0
         self.pose: Pose | None = None
         self._moment: Moment | None = None
@@ -164,19 +165,19 @@ class OdometryTracker:
         self._keyframe = _Mark(np.eye(4), 0.0, 0.0)
         self._estimator = DriftEstimator(config)
         self._registered: _Registered | None = None
-        self._unconfirmed: _Registered | None = None  # the one that odometry contradicts
+        self._unconfirmed: _Registered | None = None  # the registration that odometry contradicts
 
     def add_pose(self, T_odom_body: Pose, moment: Moment | None = None) -> None:
-        """Add the pose (4, 4) of a frame, and its moment if it is known."""
+        """Add the pose (4, 4) of a frame, and its moment if known."""
         self._moment = moment
         if self.pose is not None:
             self.travelled += float(np.linalg.norm(T_odom_body[:3, 3] - self.pose[:3, 3]))
-            # about the vertical: a robot that shakes does not turn
+            # about the vertical only, as a shaking robot does not turn
             self._turned += abs(yaw_of(inverse(self.pose) @ T_odom_body))
         self.pose = T_odom_body
 
     def forget_pose(self) -> None:
-        """Count nothing up to the next pose: odometry may have jumped."""
+        """Count nothing up to the next pose, as odometry may have jumped."""
         self.pose = None
 
     def set_keyframe(self, T_odom_body: Pose) -> None:
@@ -192,13 +193,13 @@ class OdometryTracker:
         return inverse(self._keyframe.T_odom_body) @ T_odom_body
 
     def change(self) -> Floats:
-        """Return the change (3,) of a motion since the newest keyframe per second of delay, axes of its start."""
+        """Return the derivative (3,) by the delay, seconds, of the motion since the newest keyframe, axes of its start."""
         motion = np.eye(4) if self.pose is None else self.motion(self.pose)
         return np.asarray(motion_jacobian(motion, np.array([_rates(self._keyframe.moment), self.rates]))[:, 2])
 
     @property
     def rates(self) -> Floats:
-        """(3,) velocities of the newest frame, as of a Moment; zero where they are not known."""
+        """(3,) rates of the newest frame, as in a Moment; zero where unknown."""
         return _rates(self._moment)
 
     @property
@@ -208,19 +209,19 @@ class OdometryTracker:
 
     @property
     def tremble(self) -> Floats:
-        """Covariance (6, 6) of the tilt of one frame beside its neighbours; see :class:`DriftEstimator`."""
+        """Covariance (6, 6) of a frame's tilt relative to neighbouring frames; see :class:`DriftEstimator`."""
         return self._estimator.tremble
 
     def learn(self, T_map_cloud: Pose, covariance: Floats) -> None:
         """Learn calibration and drift from a verified registration at the newest keyframe.
 
-        ``T_map_cloud`` (4, 4) and its covariance (6, 6) are of the cloud in the sensor's axes, the prior removed.
+        ``T_map_cloud`` (4, 4) and its covariance (6, 6) are of the cloud in the sensor's axes, without the prior.
         """
         self._learn_unconfirmed()
         self._learn(_Registered(T_map_cloud, covariance, self._keyframe))
 
     def learn_once_confirmed(self, T_map_cloud: Pose, covariance: Floats) -> None:
-        """Learn from a registration that contradicts odometry once the next one follows; args as :meth:`learn`."""
+        """Learn from a registration that contradicts odometry once the next one follows; args as in :meth:`learn`."""
         self._learn_unconfirmed()
         self._unconfirmed = _Registered(T_map_cloud, covariance, self._keyframe)
 
@@ -234,7 +235,7 @@ class OdometryTracker:
         self._unconfirmed = None
 
     def _learn(self, now: _Registered, contradicts: bool = False) -> None:
-        """Learn from a registration, which may contradict odometry by far."""
+        """Learn from a registration, which may strongly contradict odometry."""
         before = self._registered
         if before is not None:
             driven, turned = now.mark.travelled - before.mark.travelled, now.mark.turned - before.mark.turned
@@ -262,7 +263,7 @@ def _rates(moment: Moment | None) -> Floats:
 
 
 class ScanBuffer:
-    """Buffer of the newest 40 scans, levelled by the calibration when they are read."""
+    """Buffer of the newest 40 scans, levelled by the calibration on access."""
 
     def __init__(self, config: TrackingConfig, calibration: CalibrationEstimator) -> None:
         self._config = config

@@ -1,9 +1,9 @@
-"""Evidence of a tracked place: the search's log-likelihood ratio, with nuisances learned along the path.
+"""Evidence of a tracked place: the search's log-likelihood ratio, with nuisance parameters learned along the path.
 
-Tracking begins with an even prior over the nuisances (unchanged share of the site, kind of survey, leaks through
-foliage). They change slowly along the path: their posterior at one registration, spread a little, is the prior of the
-next (docs/integrity.md, eq. 6). So explaining half of the scan speaks for a place in a street where half has changed,
-and against it where nearly all was explained a metre before.
+Tracking starts with an even prior over the nuisance parameters (unchanged share of the site, kind of survey, leaks
+through foliage). They change slowly along the path: their posterior at one registration, spread slightly, is the prior
+of the next (docs/integrity.md, eq. 6). So explaining half of the scan speaks for a place in a street where half has
+changed, and against it where nearly all was explained a metre before.
 """
 
 from __future__ import annotations
@@ -22,10 +22,10 @@ from coview_stream.localization.evidence.likelihood import KEPT, NUISANCES, log_
 from coview_stream.localization.evidence.observation import ObservedScan
 
 # set by hand; right registrations of seven drives and three real runs hardly depend on them (docs/integrity.md)
-_SPREAD = 0.05  # standard deviation of the change of the unchanged share q between two registrations
+_SPREAD = 0.05  # sigma of the change of the unchanged share q between two registrations
 _ANOTHER = 0.01  # probability that the kind of survey and the leaks change between two registrations
 _CHANGED = 1e-4  # probability that the whole site changes between two registrations
-_BESIDE = 0.5  # probability that the right place lies metres beside a wrong one, by a slip of odometry
+_BESIDE = 0.5  # probability that the right place is metres from a wrong one, by a slip of odometry
 
 
 @dataclass(frozen=True)
@@ -33,18 +33,18 @@ class Observation:
     """Evidence of a scan for a pose."""
 
     ratio: float  # log-likelihood ratio of "the robot is here" against chance
-    likelihoods: Floats  # (Q, D, L) log-likelihood ratios by the values of the nuisances
-    rival: float = 0.0  # log-likelihood ratio of the most probable pose metres beside it; chance's without any
+    likelihoods: Floats  # (Q, D, L) log-likelihood ratios by nuisance values
+    rival: float = 0.0  # log-likelihood ratio of the most probable pose metres away; that of chance without any
 
     @property
     def against_elsewhere(self) -> float:
-        """Log-likelihood ratio of "the robot is here" against "it is metres beside, or anywhere"."""
+        """Log-likelihood ratio of "the robot is here" against "it is metres away, or anywhere"."""
         rival = math.log(_BESIDE) + max(self.rival, 0.0)
         return self.ratio - float(np.logaddexp(math.log1p(-_BESIDE), rival))
 
 
 class PlaceEvidence:
-    """Belief over the nuisances at one place, from registrations, and the evidence of a scan given them."""
+    """Belief over the nuisance parameters at one place, from registrations, and the evidence of a scan given them."""
 
     def __init__(self, base_map: BaseMap) -> None:
         self._base_map = base_map
@@ -52,7 +52,7 @@ class PlaceEvidence:
         self.clear()
 
     def clear(self) -> None:
-        """Forget the nuisances: the place is another."""
+        """Reset the nuisance parameters, for another place."""
         self._known = np.full(NUISANCES, 1.0 / np.prod(NUISANCES))
 
     def observe(self, scan: ObservedScan, T_map_odom: Pose) -> Observation:
@@ -70,7 +70,7 @@ class PlaceEvidence:
         return observed.poses, self._ratios(log_likelihoods(observed.shares, self._background(scan, T_map_odom)))
 
     def learn(self, observation: Observation) -> None:
-        """Learn the nuisances from a believed registration; others would make a wrong place usual."""
+        """Learn the nuisance parameters from a believed registration; others would make a wrong place usual."""
         likelihoods = observation.likelihoods
         posterior = self._presumed() * np.exp(likelihoods - likelihoods.max())
         self._known = posterior / posterior.sum()
@@ -82,7 +82,7 @@ class PlaceEvidence:
         return log_likelihoods(observed.shares, background)
 
     def _background(self, scan: ObservedScan, T_map_odom: Pose) -> Background:
-        """Return the background around a pose (4, 4); that of the newest is kept."""
+        """Return the background around a pose (4, 4); the newest is cached."""
         newest = self._newest
         if newest is None or newest[0] is not scan or not np.array_equal(newest[1], T_map_odom):
             _, background = observe_with_background(self._base_map.field, scan, T_map_odom[None])
@@ -90,13 +90,13 @@ class PlaceEvidence:
         return newest[2]
 
     def _ratios(self, likelihoods: Floats) -> Floats:
-        """Return the log-likelihood ratios (P,) under the prior of the nuisances."""
+        """Return the log-likelihood ratios (P,) under the prior of the nuisance parameters."""
         top = likelihoods.max(axis=(1, 2, 3))
         weighted = self._presumed() * np.exp(likelihoods - top[:, None, None, None])
         return np.asarray(top + np.log(weighted.sum(axis=(1, 2, 3))))
 
     def _presumed(self) -> Floats:
-        """Return the prior (Q, D, L) of the nuisances at the next registration."""
+        """Return the prior (Q, D, L) of the nuisance parameters at the next registration."""
         step = np.exp(-0.5 * ((KEPT[:, None] - KEPT) / _SPREAD) ** 2)  # of one share q to another
         spread = np.einsum("qr,qdl->rdl", step / step.sum(axis=1, keepdims=True), self._known)
         spread = (1.0 - _ANOTHER) * spread + _ANOTHER * spread.mean(axis=(1, 2), keepdims=True)

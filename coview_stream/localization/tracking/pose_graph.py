@@ -7,23 +7,23 @@ two poses in the tangent of the body, the estimate is the most probable one give
 * odometry: e(Z_k, X_{k-1}^-1 X_k) ~ N(0, Q_k)
 * registrations: e(Y_k, X_k) ~ N(0, R_k), under Huber's kernel on the whitened residual
 
-It is found by Gauss-Newton on X_k exp(xi_k). The linear problem of each step is a chain, whose normal equations are
-block tridiagonal: a Kalman filter and the recursion backwards of Rauch, Tung and Striebel solve it exactly (Bell, "The
-iterated Kalman smoother as a Gauss-Newton method", SIAM J. Optimization 1994; Barfoot, State Estimation for Robotics,
-chapter 3). With the measured step e, its derivative D (:func:`~coview_stream.geometry.transforms.log_se3`), and w the
-kernel's weight, min(1, 3.5 / |R^-1/2 e|), of iteratively reweighted least squares:
+Gauss-Newton on X_k exp(xi_k) finds it. The linear problem of each step is a chain with block tridiagonal normal
+equations: a Kalman filter and the backward recursion of Rauch, Tung and Striebel solve it exactly (Bell, "The iterated
+Kalman smoother as a Gauss-Newton method", SIAM J. Optimization 1994; Barfoot, State Estimation for Robotics, chapter
+3). With the residual e, its derivative D (:func:`~coview_stream.geometry.transforms.log_se3`), and w the kernel's
+weight, min(1, 3.5 / |R^-1/2 e|), of iteratively reweighted least squares:
 
     odometry       m' = F m - D^-1 e,  P' = F P F^T + D^-1 Q D^-T          F = Ad(X_k^-1 X_{k-1})
     registration   m = m' - G (D^-1 e + m'),  P = G C                      C = D^-1 R D^-T / w,  G = P' (P' + C)^-1
     backwards      xi_{k-1} = m_{k-1} + P_{k-1} F^T P'^-1 (xi_k - m')
 
-A new measurement moves the newest poses alone: those that move noticeably are linearised again, and only from the
-first of them on the filter runs again, as in iSAM2 (Kaess et al., IJRR 2012). Only the newest pose is used; smoothing
-the earlier ones reweighs their registrations.
+A new measurement moves only the newest poses: those that move noticeably are linearised again, and the filter runs
+again from the first of them, as in iSAM2 (Kaess et al., IJRR 2012). Only the newest pose is used; smoothing the earlier
+ones reweighs their registrations.
 
-The memory is bounded: of the keyframes older than the window the *filtering* belief of its first remains, from the
-measurements up to it. For a chain this is exact up to linearisation, as past and future meet in one pose; its smoothed
-belief would count the later measurements twice.
+Memory is bounded: the keyframes older than the window are replaced by the *filtered* belief of the window's first, from
+the measurements up to it. For a chain this is exact up to linearisation, as past and future meet in one pose; its
+smoothed belief would count the later measurements twice.
 """
 
 from __future__ import annotations
@@ -49,12 +49,12 @@ from coview_stream.geometry.transforms import (
 from coview_stream.geometry.validation import check_covariance, check_rigid
 
 HUBER = 3.5
-"""Standard deviations from which a registration's pull grows no more: the norm of six residuals at once, 2.4 on average
-and above this in one case of twenty; the usual 1.345 is meant for one residual. A kernel that lets go altogether would,
-with an optimistic covariance, lock the map out for good."""
+"""Sigmas beyond which a registration's pull grows no more: the norm of six residuals at once, 2.4 on average and above
+this in one case of twenty; the usual 1.345 is meant for one residual. With an optimistic covariance, a redescending
+kernel would lock out the map for good."""
 
 _RELINEARIZE = 3e-4  # metres and radians that a pose moves before its factors are linearised again
-_MAX_UPDATES = 3  # more move the newest pose by less than a hundredth of its sigma
+_MAX_UPDATES = 3  # more would move the newest pose by less than a hundredth of its sigma
 
 
 class Estimate(NamedTuple):
@@ -63,27 +63,27 @@ class Estimate(NamedTuple):
     T_map_body: Pose
     """(4, 4) float64."""
     covariance: Floats
-    """(6, 6) over (rx, ry, rz, x, y, z): a turn about the body, then a shift, along the map's axes."""
+    """(6, 6) over (rx, ry, rz, x, y, z): a rotation about the body, then a shift, along the map's axes."""
 
     def innovation(self, T_map_body: Pose, covariance: Floats) -> float:
-        """Squared Mahalanobis distance of a measured pose (4, 4), with the covariance of that measurement alone.
+        """Squared Mahalanobis distance to a measured pose (4, 4), with the covariance of that measurement alone.
 
-        If both covariances are right it is chi-square with 6 degrees of freedom: 12.6 is exceeded by one in twenty,
-        22.5 by one in a thousand.
+        With correct covariances it is chi-square with 6 degrees of freedom: 12.6 is exceeded by one in twenty, 22.5 by
+        one in a thousand.
         """
         gap: Floats = boxminus(T_map_body, self.T_map_body)
         return float(gap @ np.linalg.solve(self.covariance + covariance, gap))
 
 
 class _Gaussian(NamedTuple):
-    """A pose and its covariance (6, 6), unlike an :class:`Estimate`'s along the axes of its own body."""
+    """A pose and its covariance (6, 6) along the axes of its own body, unlike an :class:`Estimate`'s."""
 
     T: Pose
     covariance: Floats
 
 
 class _Step(NamedTuple):
-    """Belief about a step xi from where a keyframe is linearised."""
+    """Belief about a step xi from the linearisation point of a keyframe."""
 
     mean: Floats  # (6,)
     covariance: Floats  # (6, 6)
@@ -91,9 +91,9 @@ class _Step(NamedTuple):
 
 @dataclass
 class _Keyframe:
-    """One pose of the chain; its filtered estimate is as of the last run."""
+    """One pose of the chain; its filtered estimate is that of the last run."""
 
-    T: Pose  # (4, 4) T_map_body, where it is linearised
+    T: Pose  # (4, 4) T_map_body, the linearisation point
     between: _Gaussian  # this body in the frame of the previous one, or of the map for the first
     corrections: list[_Gaussian] = field(default_factory=list)  # measured poses in the map
     F: Floats = field(init=False)  # (6, 6)
@@ -104,25 +104,25 @@ class _Keyframe:
 class PoseGraph:
     """Poses of a chain of keyframes, and the covariance of the newest.
 
-    All poses and covariances are as in :class:`Estimate`. Not safe for use by two threads at once.
+    All poses and covariances are as in :class:`Estimate`. Not thread-safe.
 
     A pose that is not rigid or a covariance that is not positive definite raises InputError and changes nothing; a
     method that needs a keyframe raises RuntimeError before the first ``start``.
     """
 
     def __init__(self, window: int = 40) -> None:
-        """Smooth the newest ``window`` keyframes; older ones live on in the belief that they left behind."""
+        """Smooth the newest ``window`` keyframes; older ones are condensed into the belief of the window's first."""
         self._window = window
         self._keyframes: list[_Keyframe] = []
         self._newest_belief: _Gaussian | None = None
-        self._stale = 0  # first keyframe that the filter has not seen as it is
+        self._stale = 0  # first keyframe that has changed since the last run of the filter
 
     def __len__(self) -> int:
-        """Keyframes held: at most ``window``, however long the robot drives; zero before ``start``."""
+        """Keyframes kept: at most ``window``, however long the robot drives; zero before ``start``."""
         return len(self._keyframes)
 
     def start(self, T_map_body: Pose, covariance: Floats) -> None:
-        """Begin a new chain with a prior on the first pose; the old chain is dropped."""
+        """Start a new chain with a prior on the first pose, dropping the old one."""
         T = check_rigid(T_map_body, "T_map_body")
         prior = _Gaussian(T, along_body(check_covariance(covariance, "covariance"), T))
         self._keyframes, self._newest_belief, self._stale = [_Keyframe(T, prior)], prior, 0
@@ -130,9 +130,8 @@ class PoseGraph:
     def move(self, T_between: Pose, covariance: Floats) -> None:
         """Add a keyframe by odometry from the newest.
 
-        Args:
-            T_between: (4, 4) new body in the newest keyframe's frame, ``inverse(T_odom_last) @ T_odom_new``.
-            covariance: of the new pose if the last one were known.
+        ``T_between`` (4, 4) is the new body in the newest keyframe's frame, ``inverse(T_odom_last) @ T_odom_new``, and
+        ``covariance`` that of the new pose if the last one were known.
         """
         step = check_rigid(T_between, "T_between")
         spread = check_covariance(covariance, "covariance")
@@ -153,7 +152,7 @@ class PoseGraph:
     def correct(self, T_map_body: Pose, covariance: Floats) -> None:
         """Add a registration of the newest keyframe, under Huber's kernel.
 
-        Its prior must be removed, as it would count twice
+        Its prior must be removed, or it counts twice
         (:func:`coview_stream.localization.registration.register.remove_prior`).
         """
         T = check_rigid(T_map_body, "T_map_body")
@@ -174,7 +173,7 @@ class PoseGraph:
         return self._keyframes[-1]
 
     def _belief(self) -> _Gaussian:
-        """Return the newest keyframe's pose and covariance; solves at the first call."""
+        """Return the newest keyframe's pose and covariance; the first call solves."""
         newest = self._newest
         if self._newest_belief is None:
             self._filter()
@@ -186,7 +185,7 @@ class PoseGraph:
         return self._newest_belief
 
     def _relinearize(self) -> bool:
-        """Move the newest keyframes to their smoothed poses, back to the first that hardly moves; tell if any moved."""
+        """Move the newest keyframes to their smoothed poses, back to the first that hardly moves; True if any moved."""
         xi, steps, item = self._newest.filtered.mean, list[Floats](), self._newest
         while np.abs(xi).max() > _RELINEARIZE:
             steps.append(xi)
@@ -203,7 +202,7 @@ class PoseGraph:
         return bool(steps)
 
     def _filter(self) -> None:
-        """Linearise the stale keyframes, and filter from the first of them on."""
+        """Linearise the stale keyframes, and filter from the first of them."""
         items = self._keyframes[self._stale :]
         if not items:
             return

@@ -1,14 +1,14 @@
-"""The error of registrations that the next ones repeat: map and scan disagree, and a fit is their compromise.
+"""The systematic error of registrations, which the next ones repeat: a fit is a compromise between map and scan.
 
-The inverse Hessian is the covariance for independent residuals of one size, with each point's partner held. But a part
-of the map lies some centimetres off the others, a tree's crown looks different from above, a lidar's far rings lie too
-high: all points of a sector pull together. And a point that is off finds another partner nearby, so a fit that is off
-looks hardly worse: in a map of several passes the gradient grows by a third of what held partners make of it.
+The inverse Hessian is the covariance for independent residuals of one size, with fixed correspondences. But a part of
+the map lies some centimetres off the others, a tree's crown looks different from above, a lidar's far rings lie too
+high: all points of a sector pull together. And a point that is off finds another partner nearby, so a displaced fit
+looks hardly worse: on a map of several passes the gradient grows by a third of its growth with fixed correspondences.
 
-So a clustered sandwich estimator: C = c H^-1 B H^-1. B is the sum, over the quadrants around the body, ground and
-structure apart, of the outer products of their gradients, each a mean over the last metres, in which scanner noise
-averages out and map error does not. H is the derivative of the whole gradient by the pose with all partners sought
-anew. The fit uses up six of the eight gradients: c = 8 / (8 - 6).
+So a clustered sandwich estimator is used: C = c H^-1 B H^-1. B is the sum, over the quadrants around the body, ground
+and structure apart, of the outer products of their gradients, each a mean over the last metres, in which scanner noise
+averages out and map error does not. H is the derivative of the whole gradient by the pose, with all correspondences
+searched again. The fit uses up six of the eight gradients: c = 8 / (8 - 6).
 """
 
 from __future__ import annotations
@@ -23,39 +23,39 @@ from coview_stream.localization.registration.clouds import LocalMap, Registratio
 from coview_stream.localization.registration.register import RESIDUAL_SCALE
 
 FLOOR = np.array([*np.radians([0.001, 0.001, 0.001]), 0.001, 0.001, 0.001])
-"""Sigmas (6,) over (rx, ry, rz, x, y, z), radians and metres, that no agreement of the pairs takes away."""
+"""Sigmas (6,) over (rx, ry, rz, x, y, z), radians and metres, below which the error never falls."""
 
-_VIEW = 5.0  # metres of driving over which the view is about the same, and gradients are averaged
-_STEP = 2.0  # metres of driving between two lessons
-_EVERY = 2  # of the points: more change nothing
+_VIEW = 5.0  # metres of driving with about the same view, over which gradients are averaged
+_STEP = 2.0  # metres of driving between two updates
+_EVERY = 2  # every second point is used: more change nothing
 _MIN_PAIRS = 50
-_SHIFT = 0.03  # metres by which the pose is moved to seek partners anew: above a scanner's noise, below a wall's width
-_LEVER = 17.0  # metres: a turn moves points by as much there
-_TURNS = (0.0, 0.25 * np.pi)  # radians: two ways to cut the quadrants, as a wall may lie along a cut
+_SHIFT = 0.03  # metres by which the pose is moved to search partners again: above scanner noise, below a wall's width
+_LEVER = 17.0  # metres; at this lever arm a rotation moves points by _SHIFT
+_TURNS = (0.0, 0.25 * np.pi)  # radians: two cuts into quadrants, as a wall may lie along a cut
 _SECTORS = 8  # four quadrants, ground and structure apart
-_LEAST = 0.03  # of a direction's curvature relative to the others': below it the derivative is noise
+_LEAST = 0.03  # least curvature of a direction relative to the others'; less is noise
 
 
 class SharedErrorModel:
-    """Running average of the pairs' disagreement, sector by sector, and the covariance that comes of it."""
+    """Running average of the pairs' disagreement by sector, and the resulting covariance."""
 
     def __init__(self, config: RegistrationConfig) -> None:
         self._config = config
         self.clear()
 
     def clear(self) -> None:
-        """Forget all registrations: the place is another."""
+        """Forget all registrations of the previous place."""
         self._gradients = np.zeros((len(_TURNS), _SECTORS, 6))
         self._curvature = np.zeros((6, 6))
         self._learned_at: float | None = None  # metres driven
-        self._side = -1  # to which the pose is moved for the curvature, in turn
+        self._side = -1  # direction in which the pose is moved for the curvature, alternating
 
     def learn(
         self, source: RegistrationCloud, T_map_source: Pose, target: LocalMap, pivot: Floats, travelled: float
     ) -> None:
-        """Add a verified registration, ``travelled`` metres into the drive; other arguments: :func:`disagreement`.
+        """Add a verified registration, ``travelled`` metres into the drive; other arguments as in :func:`disagreement`.
 
-        One per two metres counts: those between see the same.
+        One per two metres counts, as those between see the same.
         """
         before = self._learned_at
         if before is not None and travelled - before < _STEP:
@@ -79,9 +79,9 @@ class SharedErrorModel:
 
 
 def clustered_covariance(gradients: Floats, curvature: Floats) -> Floats:
-    """Return the sandwich (6, 6) of (K, 8, 6) gradients, cut in K ways, and the curvature (6, 6)."""
+    """Return the sandwich (6, 6) of gradients (K, 8, 6), by K cuts into sectors, and the curvature (6, 6)."""
     diagonal = np.diag(curvature).reshape(2, 3)  # angles, shifts
-    least = np.maximum(_LEAST * diagonal.max(axis=1, keepdims=True), 1e-12)  # a direction may be without ground
+    least = np.maximum(_LEAST * diagonal.max(axis=1, keepdims=True), 1e-12)  # a direction may lack ground
     unit = 1.0 / np.sqrt(np.maximum(diagonal, least)).ravel()
     strength, directions = np.linalg.eigh(unit[:, None] * curvature * unit)
     inverse = unit[:, None] * (directions / np.maximum(strength, _LEAST)) @ directions.T * unit
@@ -99,18 +99,18 @@ def disagreement(
 ) -> tuple[Floats, Floats] | None:
     """Return the gradients (2, 8, 6) of a registration by sector, and its curvature (6, 6); None for too few pairs.
 
-    Both over (rx, ry, rz, x, y, z); rotations are about ``pivot`` (3,) in the source's frame, along the map's axes.
+    Both are over (rx, ry, rz, x, y, z); rotations are about ``pivot`` (3,) in the source's frame, along the map's axes.
     """
     source = source.every(_EVERY)
     reach, body = config.track[-1], transform(T_map_source, pivot[None])[0]
     moved = transform(T_map_source, source.points)
-    paired = kernels.nearest(target.grid, moved, reach)[0] < reach  # not trimmed: the best pairs disagree least
+    paired = kernels.nearest(target.grid, moved, reach)[0] < reach  # not trimmed, as the best pairs disagree least
     if paired.sum() < _MIN_PAIRS:
         return None
-    # a handful of points does not outweigh thousands, as in registration
+    # as in registration, a few points do not outweigh thousands
     few = len(source.points) // 10
     counts = [max(1, few, int((kind & paired).sum())) for kind in (source.above, ~source.above)]
-    weight = np.where(source.above, 1.0 / counts[0], 1.0 / counts[1])  # both kinds weigh the same
+    weight = np.where(source.above, 1.0 / counts[0], 1.0 / counts[1])  # equal weight of both kinds
     arm = (moved - body).astype(np.float32)
     gradient = _gradient(moved, arm, weight, target, reach)
     total, curvature = gradient.sum(axis=0), np.empty((6, 6))
@@ -125,7 +125,7 @@ def disagreement(
 
 
 def _gradient(moved: Points, arm: Points, weight: Floats, target: LocalMap, reach: float) -> Floats:
-    """Return each point's part (N, 6) of the gradient, with its partner sought among the map's points.
+    """Return each point's part (N, 6) of the gradient, with its partner searched among the map's points.
 
     A point on a surface pulls along its normal, with Cauchy's weight; one without a surface in all directions.
     """

@@ -1,9 +1,8 @@
-"""Evidence of a slip or of a displaced robot, between two registrations and where they contradict odometry.
+"""Evidence of a slip or a displaced robot, between two registrations and where they contradict odometry.
 
-A registration may fit away from the place where odometry leads. Either odometry is wrong (wheels slip, the robot is
-pushed) and the lidar is right, or odometry is right and a building or a stack of containers stands a metre off its
-surveyed place. The scans decide, by the ratio of their likelihoods at the one place and at all others, given the usual
-shares of this place.
+A registration may fit away from odometry's pose. Either odometry is wrong (wheels slip, the robot is pushed) and the
+lidar is right, or odometry is right and a building or a stack of containers stands a metre off its surveyed place. The
+scans decide, by the likelihood ratio of one place against all others, given the usual shares of this place.
 """
 
 from __future__ import annotations
@@ -29,15 +28,15 @@ def off_by(T_map_body: Pose, T_map_other: Pose) -> tuple[float, float]:
 
 
 def matters(metres: float, degrees: float) -> bool:
-    """Tell whether poses so far apart cannot both count as right: more than half of the alert limit."""
+    """Return whether two poses are too far apart for both to be right: more than half of the alert limit."""
     return metres > 0.5 * ALERT_METRES or degrees > 0.5 * ALERT_DEGREES
 
 
 class Dispute:
     """Candidate places while odometry is contradicted, and the scans' evidence for each of them.
 
-    The first is the one that odometry leads to. Scans of one view (a metre) see the same, so the newest of a view
-    counts, and views add up. The prior is even; a place that appears later starts with the evidence of the first.
+    The first is odometry's. Scans within one view (a metre) see the same, so the newest of a view counts, and views add
+    up. The prior is even; a place that appears later starts with the evidence of the first.
     """
 
     def __init__(self, place: PlaceEvidence, view: float) -> None:
@@ -50,16 +49,16 @@ class Dispute:
         """Forget all candidates."""
         self._poses: list[Pose] = []  # T_map_odom
         self._before = np.zeros(0)  # log-likelihood ratios of the earlier views
-        self._newest = np.zeros(0)  # and of the present one
+        self._newest = np.zeros(0)  # and of the current one
         self._begun = -math.inf  # metres driven at the start of the view
 
     def settle(
         self, scan: ObservedScan, T_map_predicted: Pose, T_map_seen: Sequence[Pose], travelled: float, risk: float
     ) -> Pose | None:
-        """Return the right ``T_map_body`` (4, 4) if odometry has slipped; None: undecided.
+        """Return the right ``T_map_body`` (4, 4) if odometry has slipped; None while undecided.
 
         The candidates are the pose by odometry and the registered ones ``T_map_seen``; ``risk`` is the accepted
-        probability that another candidate is right, so far off that it matters.
+        probability that another candidate is right that is too far off for both to be right.
         """
         if travelled - self._begun >= self._view:
             self._begun = travelled
@@ -80,7 +79,7 @@ class Dispute:
         return here[best]
 
     def _assign(self, T_map_predicted: Pose, T_map_seen: Sequence[Pose], T_odom_body: Pose) -> list[int]:
-        """Return the nearest candidate of each registered pose, and move it there; a pose far from all is a new one."""
+        """Return the nearest candidate of each registered pose, moved there; a pose far from all becomes a new one."""
         T_body_odom = inverse(T_odom_body)
         self._poses[:1] = [T_map_predicted @ T_body_odom]
         self._before = self._before if len(self._before) else np.zeros(1)
@@ -100,21 +99,21 @@ class Dispute:
 
 _REACH = 0.3  # metres: about the map's point spacing
 _MIN_RANGE, _MAX_RANGE = 2.0, 35.0  # metres from the sensor
-_HEIGHT = 1.0  # metres above the lowest of the ground nearby
+_HEIGHT = 1.0  # metres above the lowest ground nearby
 _FLOOR_RADIUS = 10.0  # metres, of that ground
 _POINTS = 400  # compared
 _MIN_POINTS = 60
-_NEWEST_SHARE = 0.3  # of a new share in the usual one: about the last three registrations
+_NEWEST_SHARE = 0.3  # weight of a new share in the usual one: averages about three registrations
 _DROP = 0.7  # of the usual share: see DisplacementCheck
 
 
 class DisplacementCheck:
-    """Check of single frames against the map, for a registration before the next one is due.
+    """Check of single frames against the map, to register before the next registration is due.
 
     A registration is due once a metre. A robot that is lifted and put down elsewhere, or carried with its wheels in the
-    air, would have a wrong pose until then. So the share of a few hundred points above the ground that have a map point
-    near them is compared with the usual share, for every frame. Below 0.7 of it were fewer than 1 % of the frames at
-    the right pose, more than half of those half a metre off, and more than 98 % anywhere else (measured once, on the
+    air, would have a wrong pose until then. So for every frame, the share of a few hundred points above the ground that
+    have a map point nearby is compared with the usual share. Below 0.7 of it were fewer than 1 % of the frames at the
+    right pose, more than half of those half a metre off, and more than 98 % anywhere else (measured once, on the
     simulated worlds 5101, 5103, 5106 and 5108; no command prints it).
     """
 
@@ -134,7 +133,7 @@ class DisplacementCheck:
             self.usual = share if self.usual is None else self.usual + _NEWEST_SHARE * (share - self.usual)
 
     def is_displaced(self, points: Points, position: Floats, T: Pose, target: LocalMap) -> bool:
-        """Tell whether a frame fits the map much less than usual; arguments are those of :meth:`learn`."""
+        """Return whether a frame fits the map much less than usual; arguments as in :meth:`learn`."""
         if self.usual is None:
             return False
         share = share_on_map(points, position, T, target)
@@ -142,7 +141,7 @@ class DisplacementCheck:
 
 
 def share_on_map(points: Points, position: Floats, T: Pose, target: LocalMap) -> float | None:
-    """Share of the points above the ground with a map point near them; None for too few points.
+    """Share of the points above the ground with a map point nearby; None for too few points.
 
     Arguments are those of :meth:`DisplacementCheck.learn`.
     """

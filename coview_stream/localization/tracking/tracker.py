@@ -1,4 +1,4 @@
-"""Tracking: registrations of the newest scans and odometry between them, in one graph of poses."""
+"""Tracking: registrations of the newest scans and odometry between them, in one pose graph."""
 
 from __future__ import annotations
 
@@ -32,14 +32,14 @@ from coview_stream.localization.tracking.shared_error import SharedErrorModel
 from coview_stream.localization.tracking.slip import DisplacementCheck
 
 _MIN_POINTS = 100  # to register
-_MIN_DISTANCE = 0.3  # metres; no uncertainty needs a registration sooner
-_MAX_SIGMA = 0.03  # metres of odometry's drift in x and in y that need a registration
-_MAX_YAW_SIGMA = math.radians(0.2)  # likewise of its heading
-_STANDING_DRIVE = 0.2  # metres of driving that standing still until the next registration counts as
+_MIN_DISTANCE = 0.3  # metres; no uncertainty requires an earlier registration
+_MAX_SIGMA = 0.03  # metres of odometry's drift in x or y that require a registration
+_MAX_YAW_SIGMA = math.radians(0.2)  # likewise for its heading
+_STANDING_DRIVE = 0.2  # metres of driving that a standstill between registrations counts as
 _START = np.diag([np.radians(0.3), np.radians(0.3), np.radians(1.5), 0.5, 0.5, 0.3]) ** 2
-"""Covariance of a place that the search has accepted and whose registration may not have converged."""
+"""Covariance of an accepted place, whose registration may not have converged."""
 _SLIP = np.diag([np.radians(0.5), np.radians(0.5), np.radians(5.0), 1.0, 1.0, 0.3]) ** 2
-"""Covariance of odometry that contradicts the lidar: wheels that slip, a robot that is carried."""
+"""Covariance of odometry that contradicts the lidar: slipping wheels, a carried robot."""
 
 _RISEN = np.diag([np.radians(1.0), np.radians(1.0), 0.0, 0.0, 0.0, 0.3]) ** 2
 """Covariance of a height by structure alone, and of an attitude by odometry."""
@@ -52,7 +52,7 @@ class Tracker:
         T_map_odom: (4, 4) map <- odometry, by the newest keyframe.
         ground: offset of the site's ground against the survey's.
         change: ground that was dug or filled since the survey.
-        risen: metres by which the newest registration has put the robot higher, as its ground is not the survey's.
+        risen: metres by which the newest registration has raised the robot, as its ground is not the survey's.
         odometry: metres driven, and drift.
     """
 
@@ -66,7 +66,7 @@ class Tracker:
         self.ground = GroundOffset()
         self.change = GroundChange(base_map.field)
         self.risen = 0.0
-        self._graph = PoseGraph()  # of clouds in the sensor's own axes: independent of the calibration
+        self._graph = PoseGraph()  # of cloud poses in the sensor's axes, independent of the calibration
         self._calibration = calibration
         self.odometry = OdometryTracker(config.tracking, calibration)
         self._matcher = MapMatcher(base_map, config)
@@ -74,10 +74,10 @@ class Tracker:
         self._scans = ScanBuffer(config.tracking, calibration)
         self._unregistered = 0  # frames since the newest registration
         self._shared_error = SharedErrorModel(config.registration)
-        self._learned_at = -math.inf  # metres driven at the newest lesson about the place
+        self._learned_at = -math.inf  # metres driven when the place was last learned
         self._disputed = False  # the last match contradicted odometry
-        self._held: LocalMap | None = None  # newest crop: robots that share a cache do not drop each other's
-        self._doubt = 1.0  # how many times the usual evidence exceeds the newest believed one
+        self._held: LocalMap | None = None  # newest crop, so that robots with a shared cache do not drop each other's
+        self._doubt = 1.0  # ratio of the usual evidence to the newest believed one
 
     def add_scan(self, scan: RawScan) -> None:
         """Add a frame: its points, one per voxel, and its odometry."""
@@ -91,11 +91,11 @@ class Tracker:
         self.odometry.forget_pose()
 
     def forget_scans(self) -> None:
-        """Drop all points; the next registration uses the next frame alone."""
+        """Drop all points; the next registration uses only the next frame."""
         self._scans.keep_newest(0)
 
     def prefetch_map(self, T_odom_body: Pose) -> None:
-        """Crop the map on a frame without a registration, as a new crop takes as long as one."""
+        """Crop the map at a frame without a registration, as a new crop takes as long as a registration."""
         if (target := self._target(T_odom_body)) is not None:
             target.prepare()
 
@@ -120,10 +120,10 @@ class Tracker:
     def start(
         self, registration: Registration, T_odom_body: Pose, travelled: float, T_odom_found: Pose | None = None
     ) -> None:
-        """Begin at an accepted place, with a wide covariance.
+        """Start at an accepted place, with a wide covariance.
 
         ``registration``, metres ``travelled`` and ``T_odom_found`` (4, 4) are of the accepted keyframe, ``T_odom_body``
-        (4, 4) is of the newest frame, which is the keyframe without a ``T_odom_found``.
+        (4, 4) is of the newest frame; without ``T_odom_found`` this is the keyframe.
         """
         self._matcher.clear()
         self.ground.clear()
@@ -151,10 +151,10 @@ class Tracker:
         Args:
             cloud: (N, 3) the newest frame, already added, in the sensor's axes.
             T_odom_body: (4, 4) its odometry.
-            standing_still: use only frames since the last registration, and trust odometry a little less: repeated
+            standing_still: use only frames since the last registration, and trust odometry slightly less: repeated
                 views of a standing robot must not add up to certainty.
-            newest_only: use the newest frame alone, as the frames are in doubt.
-            on_doubt: called if the place is contradicted, before it is looked for metres around: tenths of a second.
+            newest_only: use only the newest frame, as the frames are in doubt.
+            on_doubt: called if the place is contradicted, some tenths of a second before the search around it is done.
         """
         belief = self._predict(T_odom_body, standing_still)
         self._scans.keep_newest(1 if newest_only else max(1, self._unregistered) if standing_still else MAX_FRAMES)
@@ -168,7 +168,7 @@ class Tracker:
         T_map_odom = belief.T_map_body @ inverse(T_odom_body)
         points = self.change.without_changed(points, T_map_odom, T_odom_body[:3, 3], target)
         newest = self._scans.newest
-        # older frames add to a sparse newest one, but cannot replace a blind one
+        # older frames may complement a sparse newest frame, but not replace a blind one
         count = 0 if newest is None else min(len(points.points), len(newest))
         if count < _MIN_POINTS:
             verdict = MatchVerdict(RejectionReason.BLIND, f"only {count} points to register")
@@ -196,7 +196,7 @@ class Tracker:
         if verdict.verified or verdict.cause is RejectionReason.ODOMETRY:
             self._disputed = not (verdict.verified or match.moves_place)
         if match.moves_place:
-            # odometry has slipped, or drifts as usual: go on at the lidar's pose
+            # odometry has slipped, or drifts as usual: continue at the lidar's pose
             self.odometry.learn_once_confirmed(T_map_cloud, match.covariance)
             self._restart(T_map_cloud, match.covariance + self._shared_error.covariance, T_odom_body)
         elif believed:
@@ -205,14 +205,14 @@ class Tracker:
             self._set_belief(T_odom_body)
             self.risen = self._learn(match, T_odom_body[:3, 3])
             self._set_belief(T_odom_body)
-            if self.risen:  # a lean that was measured on ground that is not the survey's was none
+            if self.risen:  # a lean measured on changed ground is wrong
                 here = self.belief
                 self._calibration.forget_tilt()
                 self.odometry.forget_registration()
                 T_map_body = pose_from(np.eye(3), [0.0, 0.0, self.risen]) @ here.T_map_body
                 self._restart(self._of_cloud(T_map_body), here.covariance + _RISEN, T_odom_body)
             return
-        self._scans.keep_newest(0)  # bad frames among the newest must not spoil the next registration too
+        self._scans.keep_newest(0)  # bad frames must not spoil the next registration, too
 
     def predicted_covariance(self) -> Floats:
         """Covariance (6, 6) over (rx, ry, rz, x, y, z) after the metres driven since the newest keyframe."""
@@ -228,8 +228,8 @@ class Tracker:
     def reported_covariance(self, mount_and_clock: bool = True) -> Floats:
         """Covariance (6, 6) over (x, y, z, roll, pitch, yaw), map axes, of the body at the stamp.
 
-        Sum of the cloud's by the graph and by odometry since, the error that all registrations share, the tilt that
-        trembles, the ground's, and, unless they are left out, errors of mount and clock.
+        It is the sum of the cloud's by the graph and by odometry since, the error shared by registrations, the jitter
+        of the tilt, the ground's and, unless left out, the errors of mount and clock.
         """
         total = self.predicted_covariance() + self._shared_error.covariance + self.odometry.tremble
         total[5, 5] += self.change.others.variance + self.change.alone + self.ground.sigma**2
@@ -239,7 +239,7 @@ class Tracker:
         return swap_rotation_translation(total)
 
     def protection_level(self) -> ProtectionLevel:
-        """Metres and degrees that the error exceeds once in a thousand; wider on less evidence than usual."""
+        """Metres and degrees that the error exceeds once in a thousand poses; wider on less evidence than usual."""
         others = self._calibration.calibration.heights(self.change.others)
         return protection_level(self.reported_covariance(), self._doubt, others=others)
 
@@ -284,7 +284,7 @@ class Tracker:
         self.T_map_odom = self.belief.T_map_body @ inverse(T_odom_body)
 
     def _learn(self, match: MapMatch, position: Floats) -> float:
-        """Learn from a verified registration: odometry's drift, the usual shares here, errors that repeat.
+        """Learn from a verified registration: odometry's drift, the usual shares here, and systematic errors.
 
         Return metres by which the robot has to rise, as the ground is not the survey's.
         """

@@ -1,1 +1,1 @@
-"""Witnesses of motion: clouds, odometry and map held against each other, and which of them lies."""
+"""Witnesses of motion: clouds, odometry and map compared with each other, to find the one that is wrong."""

@@ -1,9 +1,9 @@
 """Agreement of the motions that odometry, clouds and map show over a step, as likelihoods.
 
-Over a step odometry moves by o, the clouds, registered to each other, by l, and registrations to the map by m. Either
-registration fails with a small probability and then says anything: mostly something within metres of odometry's motion,
-where it began, but there is no motion that it cannot say (Student's t with one degree of freedom). Motions are planar:
-(x, y, heading) in the level axes of the earlier body.
+Over a step odometry moves by o, the clouds, registered to each other, by l, and registrations to the map by m. Each
+registration fails with a small probability and is then arbitrary: mostly within metres of odometry's motion, where it
+started, but any motion is possible (Student's t with one degree of freedom). Motions are planar: (x, y, heading) in the
+level axes of the earlier body.
 """
 
 from __future__ import annotations
@@ -20,20 +20,20 @@ from coview_stream.geometry.transforms import wrap_angle
 from coview_stream.localization.witness.stamps import StepStamps
 
 FAILS = 0.05
-"""Probability that clouds are registered wrongly, where they fit each other as usual."""
+"""Probability that clouds are registered wrongly, given their usual fit."""
 MAP_FAILS = 0.02
-"""Likewise a verified registration to the map."""
+"""Likewise for a verified registration to the map."""
 ALONE = 0.05
 """Probability that clouds of one place do not fit each other."""
 ANYWHERE: Floats = np.array([2.0, 2.0, math.radians(20.0)])
 """Scale of a wrong registration about odometry's motion: metres, radians."""
 _APART = 0.7  # probability that clouds of several places do not fit each other
-_ACCELERATIONS = np.array([0.25, 0.25, 0.12])  # m/s^2 and rad/s^2 of wheeled robots beyond the speeds about a hole
-_WHOLE = 0.01  # seconds^2: odometry of five frames per second has no holes
+_ACCELERATIONS = np.array([0.25, 0.25, 0.12])  # m/s^2 and rad/s^2 of wheeled robots beyond the speeds around a hole
+_WHOLE = 0.01  # seconds^2; odometry of five frames per second has no holes
 
 
 class Seen(NamedTuple):
-    """Motion (3,) as seen by one witness, with its covariance (3, 3)."""
+    """Motion (3,) seen by one witness, with its covariance (3, 3)."""
 
     motion: Floats
     covariance: Floats
@@ -45,25 +45,25 @@ class Step:
 
     seconds: float
     odometry: Seen
-    clouds: Seen | None  # None where there is too little to see
+    clouds: Seen | None  # None if there is too little to register
     on_map: Seen | None  # None without a verified registration at both ends
-    path_before: Floats  # (L, 3) odometry's planar poses by LAGS before the begin of the step
-    path_now: Floats  # and before its end
+    path_before: Floats  # (L, 3) odometry's planar poses by LAGS before the start of the step
+    path_now: Floats  # likewise before its end
     fails: float = FAILS  # probability that the clouds' registration is wrong, by their fit
-    apart: bool = False  # the clouds fit each other much less than usual
-    copied: bool = False  # the clouds are the same bytes
-    same: float | None = None  # share of points that stand where they stood, if the clouds hardly moved
-    unsure: Floats | None = None  # (2, L) seconds^2 by which odometry at these poses misses accelerations in holes
+    apart: bool = False  # whether the clouds fit each other much less than usual
+    copied: bool = False  # whether the clouds are identical bytes
+    same: float | None = None  # share of unmoved points, if the clouds hardly moved
+    unsure: Floats | None = None  # (2, L) seconds^2 of accelerations hidden in holes of odometry at these poses
     stamps: StepStamps | None = None  # of the clouds
-    start: Floats | None = None  # (3,) from which the clouds' registration began beside odometry's motion
+    start: Floats | None = None  # (3,) second start of the clouds' registration beside odometry's motion
     tilting: float = 0.0  # radians per second of the body about its x and y
-    parts: tuple[tuple[float, Floats, Floats], ...] = ()  # seconds, odometry and clouds, where the step is known finer
+    parts: tuple[tuple[float, Floats, Floats], ...] = ()  # seconds, odometry, clouds of its parts, if known
 
 
 def likelihood(step: Step, motion: Floats, spread: Floats, alone: float) -> Floats:
-    """Return the likelihood of a step's clouds and map if a motion (..., 3) with a covariance (..., 3, 3) is expected.
+    """Return the likelihood of a step's clouds and map, given the expected motion (..., 3) and covariance (..., 3, 3).
 
-    Either registration may be wrong; where both are right they err together by the expected motion's covariance.
+    Either registration may be wrong; two right ones share the errors of the expected motion.
     """
     seen, on_map, o = step.clouds, step.on_map, step.odometry.motion
     if seen is None and on_map is None:
@@ -89,15 +89,15 @@ def likelihood(step: Step, motion: Floats, spread: Floats, alone: float) -> Floa
 
 
 def _wrong(step: Step, seen: Seen) -> float:
-    """Return the density of the clouds' motion if they are registered wrongly: near a motion that it began with."""
+    """Return the density of the clouds' motion if they are registered wrongly: near one of its starts."""
     density = anywhere(seen.motion - step.odometry.motion)
     return density if step.start is None else 0.5 * (density + anywhere(seen.motion - step.start))
 
 
 def at_once(step: Step, covariance: Floats) -> float:
-    """Return the likelihood that clouds have left odometry's motion at one moment of a step: in one of its parts.
+    """Return the likelihood that clouds left odometry's motion at one moment of a step: in one of its parts.
 
-    A body that is carried, or whose wheels slip, leaves it by and by.
+    A body that is carried, or whose wheels slip, leaves it gradually.
     """
     gaps = [between(odometry, clouds) for _, odometry, clouds in step.parts]
     squares = [float(gap @ np.linalg.solve(covariance, gap)) for gap in gaps]
@@ -105,7 +105,7 @@ def at_once(step: Step, covariance: Floats) -> float:
 
 
 def of_several_places(step: Step) -> float:
-    """Return the likelihood of a step's clouds and map where each is registered to anything."""
+    """Return the likelihood of a step's clouds and map if both are registered arbitrarily."""
     likely = 1.0
     for seen in (step.clouds, step.on_map):
         likely *= 1.0 if seen is None else anywhere(seen.motion - step.odometry.motion)
@@ -113,16 +113,16 @@ def of_several_places(step: Step) -> float:
 
 
 def anywhere(gap: Floats) -> float:
-    """Return the density of a wrong registration (3,) beside odometry's motion: Student's t, one degree of freedom."""
+    """Return the density of a wrong registration (3,) relative to odometry's motion: Student's t, one dof."""
     square = float((np.append(gap[:2], wrap_angle(float(gap[2]))) ** 2 / ANYWHERE**2).sum())
     return 1.0 / (math.pi**2 * float(ANYWHERE.prod()) * (1.0 + square) ** 2)
 
 
 def normal(gap: Floats, covariance: Floats) -> Floats:
-    """Return the density of gaps (..., 3) of planar motions."""
+    """Return the density of gaps (..., 3) between planar motions."""
     x, y, turn = gap[..., 0], gap[..., 1], (gap[..., 2] + math.pi) % (2.0 * math.pi) - math.pi
     (xx, xy, xt), (_, yy, yt), (_, _, tt) = np.moveaxis(covariance, (-2, -1), (0, 1))
-    # by cofactors: for every two lags an inverse of its own would take ten times as long
+    # by cofactors, as separate inverses for every two lags would take ten times as long
     a, b, c = yy * tt - yt * yt, xt * yt - xy * tt, xy * yt - xt * yy
     det = xx * a + xy * b + xt * c
     square = a * x * x + (xx * tt - xt * xt) * y * y + (xx * yy - xy * xy) * turn * turn
@@ -131,7 +131,7 @@ def normal(gap: Floats, covariance: Floats) -> Floats:
 
 
 def density(C: Floats, sigmas: Floats) -> float:
-    """Return the density of a planar motion (3,) about none, by sigmas (3,)."""
+    """Return the density of a planar motion (3,) about zero, by sigmas (3,)."""
     return float(normal(C, np.diag(sigmas**2)))
 
 
@@ -144,5 +144,5 @@ def unsure(step: Step) -> Floats | None:
 
 
 def hidden_by(seconds: Floats) -> Floats:
-    """Covariance (..., 3, 3) of accelerations that act over half of ``seconds`` (...) squared, unseen by odometry."""
+    """Covariance (..., 3, 3) of accelerations over half of ``seconds`` (...) squared, hidden from odometry."""
     return np.asarray(np.square(seconds)[..., None, None] * np.diag(_ACCELERATIONS**2))

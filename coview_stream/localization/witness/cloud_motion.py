@@ -1,10 +1,10 @@
-"""Motion between two clouds, registered to each other without the map and without belief in odometry.
+"""Motion between two clouds, registered to each other without the map and without trust in odometry.
 
-The registration starts at odometry's motion. Where another start could explain the clouds as well (no motion at all, as
-of a scan that is repeated) or the clouds fit less than usual (a sensor that was turned, a cloud of another time), the
-clouds' own fit chooses: the share of the structure that lies on the earlier cloud's surfaces. So odometry cannot hide
-a motion that it does not have. In foliage few points lie on any surface, their own cloud's either, and the usual fit is
-relative to that share. Motions are planar: (x, y, heading) in the level axes of the earlier body.
+The registration starts at odometry's motion. Where another start could explain the clouds as well (no motion, as of a
+repeated scan) or the clouds fit less than usual (a turned sensor, a cloud of another time), the clouds' own fit
+decides: the share of the structure that lies on the earlier cloud's surfaces. So odometry cannot hide a motion that it
+lacks. In foliage few points lie on any surface, even in their own cloud, and the usual fit is relative to that share.
+Motions are planar: (x, y, heading) in the level axes of the earlier body.
 """
 
 from __future__ import annotations
@@ -30,21 +30,21 @@ from coview_stream.localization.registration.surfaces import (
     surface_points,
 )
 
-_ON_SURFACE = 0.1  # metres from an earlier surface, across it: its thickness, one sigma, is no more than 0.15
-_REACH = 1.0  # metres to the nearest point of the surface, along it: sparse lidars have rings so far apart
-_SAMPLE = 300  # points of which the fit is counted
-_FEWEST = 40  # points of structure; with fewer, the clouds do not show how they moved
-_COARSE = 0.4  # metres, of the fit of starts that are not registered yet
-_USUAL = 0.7  # times the usual fit, below which other starts are tried
+_ON_SURFACE = 0.1  # metres across an earlier surface, whose thickness is 0.15 (one sigma) at most
+_REACH = 1.0  # metres along the surface to its nearest point: the ring spacing of sparse lidars
+_SAMPLE = 300  # points that measure the fit
+_FEWEST = 40  # points of structure; fewer do not show the clouds' motion
+_COARSE = 0.4  # metres, for the fit of starts before registration
+_USUAL = 0.7  # share of the usual fit below which other starts are tried
 _LEARNS = 0.1  # weight of a new fit in the usual one
-_STARTS = 2  # registered of those, the best
+_STARTS = 2  # best of those, which are registered
 ALIKE = 0.03
-"""Difference of fits that counting so many points does not resolve (one sigma)."""
+"""Difference of fits below the resolution of counting so many points (one sigma)."""
 APART = 2.0
-"""Misfit from which clouds do not fit each other."""
+"""Misfit above which clouds do not fit each other."""
 _STAYS = 0.06  # metres: three sigmas of a motion
-_NEAR_ZERO = 0.3  # metres and radians of a motion that a copy may show
-_SAME = 0.05  # metres within which a lidar's noise leaves a point of a copy
+_NEAR_ZERO = 0.3  # metres and radians, largest motion of a copy
+_SAME = 0.05  # metres by which a lidar's noise moves a point of a copy at most
 _UNKNOWN = 1e4  # variance of a motion that cannot be registered
 
 
@@ -53,30 +53,30 @@ class CloudMotion(NamedTuple):
 
     motion: Floats  # (3,) x, y, heading
     covariance: Floats  # (3, 3), wide along a tunnel
-    fit: float  # share of the structure that lies on the earlier surfaces
-    usual: float  # the same, as expected by the motions before and the structure on the scan's own surfaces
-    T: Pose | None  # (4, 4) in the axes of the earlier body; None where none can be registered
-    same: float | None = None  # share of the structure's points that stand where they stood, of a motion near zero
+    fit: float  # share of the structure on the earlier surfaces
+    usual: float  # expected fit, by earlier motions and the structure on the scan's own surfaces
+    T: Pose | None  # (4, 4) in the axes of the earlier body; None if registration fails
+    same: float | None = None  # share of unmoved structure points, for a motion near zero
 
     @property
     def misfit(self) -> float:
-        """How many times worse than usual the clouds fit."""
+        """Factor by which the clouds fit worse than usual."""
         return (self.usual + ALIKE) / (self.fit + ALIKE)
 
 
 class CloudMotionMeter:
-    """Meter of the motion between clouds, which remembers how well they fit usually."""
+    """Meter of the motion between clouds, with memory of their usual fit."""
 
     def __init__(self, config: RegistrationConfig) -> None:
         self._config = config
-        self._usual: float | None = None  # share of a scan's structure on its own surfaces that lies on earlier ones
+        self._usual: float | None = None  # share of a scan's structure on its own surfaces that is on earlier ones
 
     def measure(
         self, before: RawScan, now: RawScan, calibration: Calibration, guess: Floats | None = None
     ) -> CloudMotion | None:
         """Return the motion between two scans; None where there is too little to register.
 
-        ``guess`` (3,) is a motion to begin with beside odometry's.
+        ``guess`` (3,) is another motion to start from, beside odometry's.
         """
         here = np.zeros(3)
         target = LocalMap(*surface_points(before.levelled(calibration) - before.position.astype(np.float32)))
@@ -85,7 +85,7 @@ class CloudMotionMeter:
         if len(target.points) < MIN_PAIRS or int(scan.above.sum()) < _FEWEST:
             return None  # bare ground looks alike everywhere
         target.prepare()
-        # in odometry's axes, about the body: a motion that is odometry's turns nothing
+        # in odometry's axes, about the body: odometry's motion has no rotation there
         odometry = pose_from(np.eye(3), now.position - before.position)
         turned = before.T_odom_body[:3, :3] @ now.T_odom_body[:3, :3].T
         none = pose_from(turned, here)
@@ -96,7 +96,7 @@ class CloudMotionMeter:
             found.append(self._registered(scan, target, pose_from(rot_z(turn), shift)))
         if fit_of(scan, target, none) > max(fit for *_, fit in found):
             still = self._registered(scan, target, none)
-            # rings lie on each other where nothing moves, too; but a copy stays where it began
+            # rings coincide where nothing moves, too; but a copy stays where it started
             if still[0] is not None and float(np.linalg.norm(still[0][:3, 3])) < _STAYS:
                 found.append(still)
         flat = fit_of(scan, LocalMap(*surface_points(scan_points)), np.eye(4))
@@ -110,10 +110,10 @@ class CloudMotionMeter:
         if best[0] is None:
             usual = flat * (self._usual or 0.0)
             unknown = CloudMotion(np.zeros(3), _UNKNOWN * np.eye(3), fit_of(scan, target, odometry), usual, None)
-            # as many pairs as a registration takes have to be possible
+            # None unless a registration's number of pairs would be possible
             return unknown if unknown.misfit > APART and flat * int(scan.above.sum()) >= MIN_PAIRS else None
         if self._usual is None:
-            self._usual = min(1.0, best[2] / max(flat, ALIKE))  # on no surfaces does a cloud lie better than on its own
+            self._usual = min(1.0, best[2] / max(flat, ALIKE))  # no surfaces fit a cloud better than its own
         usual = flat * self._usual
         self._usual += _LEARNS * (best[2] - usual)
         T_now = pose_from(best[0][:3, :3] @ now.T_odom_body[:3, :3], before.position + best[0][:3, 3])
@@ -139,12 +139,12 @@ class CloudMotionMeter:
             covariance = registration_covariance(information, self._config)
         except InputError:
             return None, np.eye(6), 0.0
-        # along a tunnel the clouds know nothing, and stay where they began
+        # along a tunnel the clouds show nothing, and stay at the start
         return T, covariance, fit_of(scan, target, T)
 
 
 def fit_of(scan: RegistrationCloud, target: LocalMap, T: Pose, across: float = _ON_SURFACE) -> float:
-    """Return the share of the scan's structure that lies on the target's surfaces at a pose; 0 of none."""
+    """Return the share of the scan's structure on the target's surfaces at a pose; 0 without structure."""
     rows = _some_structure(scan)
     if not len(rows):
         return 0.0
@@ -162,7 +162,7 @@ def _some_structure(scan: RegistrationCloud) -> Ints:
 
 
 def _starts(odometry: Pose) -> Poses:
-    """Return motions (K, 4, 4) to try: parts of odometry's, backwards too, turned by all angles, and to all sides."""
+    """Return motions (K, 4, 4) to try: parts of odometry's, also backwards, turned by all angles, and to all sides."""
     poses = [pose_from(np.eye(3), share * odometry[:3, 3]) for share in (-2.0, -1.0, -0.5, 0.5, 1.5, 2.0)]
     poses += [pose_from(rot_z(np.radians(angle)), odometry[:3, 3]) for angle in range(-175, 181, 5) if angle]
     for radius in (0.75, 1.5, 2.25, 3.0, 4.0, 5.0):

@@ -1,10 +1,10 @@
 """Conventions: the units and axes in which clouds and odometry are sent, by the motions that both see.
 
-The ground tells which axis of the clouds points up. A *reading* says how clouds and odometry may have been sent; under
+The ground shows which axis of the clouds points up. A *reading* says how clouds and odometry may have been sent. Under
 each, odometry's motion is compared with that of pairs of clouds, which
 :mod:`coview_stream.localization.witness.first_motions` registers. The log odds of a reading are those of "odometry
-follows the clouds" against "the two have nothing to do with each other", added over the pairs; as a registration fails
-now and then, no single pair decides. The doctor and the localizer share all of it.
+follows the clouds" against "the two are unrelated", summed over the pairs; as registrations sometimes fail, no single
+pair decides. The doctor and the localizer share all of this.
 """
 
 from __future__ import annotations
@@ -38,14 +38,14 @@ from coview_stream.odometry.gravity import ground_plane
 HEADING, SCALE = math.radians(8.0), 0.12
 """Heading of the lidar on the body, radians, and error of odometry's scale that are no other convention."""
 SURE = math.log(99.0)
-"""Log odds of a finding: two motions that agree may be chance (1 in 48), three are not (1 in 340)."""
+"""Log odds of a finding: agreement of two motions may be chance (1 in 48), that of three is not (1 in 340)."""
 STILL = 0.5  # metres
 BASELINE = 1.0  # metre between two clouds that are compared
 
 _FAILS = 0.1  # probability that a registration fails, as in the calibration
 METRES_PER_RADIAN = 5.0
-_SWAY = math.radians(0.3)  # sigma of a turn about x or y: the registration's and that of odometry's level, 0.2 each
-_FARTHEST = 300.0  # metres; the median of a lidar's ranges is less, anywhere
+_SWAY = math.radians(0.3)  # sigma of a rotation about x or y: 0.2 each by registration and by odometry's level
+_FARTHEST = 300.0  # metres; above the median range of any lidar anywhere
 MILLIMETRE = 0.001  # metres
 
 UP = np.array([0.0, 0.0, 1.0])
@@ -54,7 +54,7 @@ AXIS_NAMES = ("+z", "-z", "+y", "-y", "+x", "-x")
 R_body_camera = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])
 
 Change = Callable[[Pose], Pose]
-"""Odometry's poses -> poses as they should have been sent."""
+"""Maps odometry's poses to the poses that should have been sent."""
 
 RIVALS: dict[str, Change] = {
     "inverse": inverse,
@@ -64,7 +64,7 @@ RIVALS: dict[str, Change] = {
     "millimetres": lambda T: pose_from(T[:3, :3], MILLIMETRE * T[:3, 3]),
     "feet": lambda T: pose_from(T[:3, :3], FOOT * T[:3, 3]),
 }
-"""Usual mistakes in odometry, each by the change that mends it."""
+"""Usual mistakes in odometry, each with the change that corrects it."""
 
 
 def _order_mended(T: Pose) -> Pose:
@@ -88,12 +88,12 @@ class Pair(NamedTuple):
 
 @dataclass(frozen=True)
 class Reading:
-    """A way in which clouds and odometry may have been sent; ``found`` and ``remedy`` say it to people.
+    """A way in which clouds and odometry may have been sent, with a finding and a remedy for people.
 
     Attributes:
         heading: of the body's x in the level axes of the clouds, radians.
         mirrored: whether the clouds' y points right.
-        change: mends odometry.
+        change: correction of odometry.
     """
 
     found: str
@@ -105,12 +105,12 @@ class Reading:
 
 @dataclass(frozen=True)
 class Fit:
-    """Odometry against the clouds' motion, medians over pairs."""
+    """Odometry against the clouds' motion, as medians over pairs."""
 
     odds: float  # log odds that odometry follows the clouds, over all pairs
-    misfit: float  # metres, a radian counting as five
+    misfit: float  # metres, with a radian as five
     yaw: float  # angle from odometry's motion to the clouds', radians: the heading of the lidar on the body
-    spread: float  # deviation from it
+    spread: float  # deviation from ``yaw``
     scale: float  # the clouds' distance over odometry's
     pairs: int  # number of pairs that moved
 
@@ -132,11 +132,11 @@ ODOMETRY = (
     Reading("odometry is in millimetres", "send metres", change=RIVALS["millimetres"]),
     Reading("odometry is in feet", "send metres", change=RIVALS["feet"]),
 )  # fmt: skip
-"""Readings of odometry, with clouds as they should be."""
+"""Readings of odometry, with correct clouds."""
 
 FEET = Reading("clouds are in feet", "send metres")
 MILLIMETRES = Reading("clouds are in millimetres", "send metres")
-"""Readings of clouds that are multiplied before they are registered; millimetres are known by :func:`unit_of`."""
+"""Readings of clouds that are scaled before registration; :func:`unit_of` detects millimetres."""
 MIRRORED = Reading(
     "clouds and odometry mirror each other: the axes of one are left-handed (y points right)",
     f"send both with {AS_SENT_WORDS}", mirrored=True,
@@ -161,7 +161,7 @@ def turning(start: Floats, end: Floats) -> Floats:
 
 
 def unit_of(points: Points) -> float:
-    """Return the metres of a cloud's unit (N, 3): a thousandth where its points lie farther than any lidar sees."""
+    """Return the unit of a cloud (N, 3) in metres: a thousandth where its points lie beyond any lidar's range."""
     finite = norms(points[:: 1 + len(points) // 2000])
     return MILLIMETRE if len(finite) and float(np.median(finite)) > _FARTHEST else 1.0
 
@@ -169,28 +169,28 @@ def unit_of(points: Points) -> float:
 def _log_odds(gap: float, far: float, farther: float, sigma: float) -> float:
     """Return the log odds that odometry follows the clouds by one motion, ``gap`` metres from it.
 
-    If it follows, the gap stays within the heading and scale that are no finding, over ``far`` metres; if not, it is
-    an unrelated motion of up to ``farther`` metres. The clouds' motion has its ``sigma``, and fails now and then.
+    If it follows, the gap stays within the heading and scale that are no finding, over ``far`` metres; if not, odometry
+    is an unrelated motion of up to ``farther`` metres. The clouds' motion has ``sigma``, and sometimes fails.
     """
     return _mixed(_gaussian(gap, math.hypot(math.hypot(HEADING, SCALE) * far, sigma), farther))
 
 
 def _gaussian(gap: float, sigma: float, farther: float) -> float:
-    """Return the ratio of two likelihoods of a gap in a plane: within ``sigma``, and within ``farther`` besides."""
+    """Return the likelihood ratio of a planar gap: within ``sigma``, against within ``farther`` in addition."""
     follows, unrelated = sigma**2, sigma**2 + farther**2
     return unrelated / follows * math.exp(0.5 * gap**2 * (1.0 / unrelated - 1.0 / follows))
 
 
 def _mixed(ratio: float) -> float:
-    """Return the log odds of a motion by its ratio of likelihoods, if a registration fails now and then."""
+    """Return the log odds of a motion by its likelihood ratio, if registrations sometimes fail."""
     return math.log(((1.0 - _FAILS) * ratio + _FAILS) / (_FAILS * ratio + 1.0 - _FAILS))
 
 
 def fit(pairs: Sequence[Pair], reading: Reading = AS_SENT) -> Fit:
-    """Compare the clouds' motions with odometry's, both as a reading has them."""
+    """Compare the clouds' motions with odometry's, both under a reading."""
     change = reading.change or (lambda T: T)
     odometry = np.array([(change(pair.before), change(pair.after)) for pair in pairs]).reshape(-1, 2, 4, 4)
-    # all at once, which is quicker
+    # all at once, for speed
     turns = log_so3(np.swapaxes(odometry[:, 0, :3, :3], -1, -2) @ odometry[:, 1, :3, :3])
     seen = log_so3(np.array([pair.motion[:3, :3] for pair in pairs]).reshape(-1, 3, 3))
     misfits, ratios, odds, sways = [], [], 0.0, np.zeros(2)
@@ -198,7 +198,7 @@ def fit(pairs: Sequence[Pair], reading: Reading = AS_SENT) -> Fit:
         moved = planar_motion(before, after)
         step, swayed = complex(moved[0], moved[1]), complex(turned[0], turned[1])
         driven, sway, turn = _as_read(pair.motion, rotation, reading)
-        if max(abs(step), abs(driven)) < STILL:  # read so, the robot stood
+        if max(abs(step), abs(driven)) < STILL:  # under this reading the robot stood
             continue
         misfits.append(abs(step - driven) + METRES_PER_RADIAN * abs(wrap_angle(moved[2] - turn)))
         far = max(abs(driven), BASELINE)
@@ -206,7 +206,7 @@ def fit(pairs: Sequence[Pair], reading: Reading = AS_SENT) -> Fit:
         sways += [_sways_odds(each, swayed) for each in (sway, _other_hand(sway))]
         if min(abs(step), abs(driven)) > STILL:
             ratios.append(driven / step)
-    # sways tell a mirror's sides apart, and nothing else; those of odometry in a plane do not
+    # sways only tell a mirror's sides apart; those of planar odometry do not
     this, other = np.logaddexp(sways, 0.0)
     odds += min(0.0, float(this - other))
     misfit = float(np.median(misfits)) if misfits else math.inf
@@ -228,7 +228,7 @@ def _other_hand(sway: complex) -> complex:
 
 
 def _as_read(motion: Pose, rotation: Floats, reading: Reading) -> tuple[complex, complex, float]:
-    """Return the clouds' motion (4, 4) in the body's axes: x and y, the turn about x and about y, and about z.
+    """Return the clouds' motion (4, 4) in the body's axes: x and y, the turns about x and y, and the turn about z.
 
     ``rotation`` (3,) is its rotation vector.
     """
@@ -242,7 +242,7 @@ def _as_read(motion: Pose, rotation: Floats, reading: Reading) -> tuple[complex,
 def turned_clouds(axis: int, heading: float) -> Reading:
     """Return the reading of clouds whose axis number ``axis`` of :data:`AXES` points up, the body's x at ``heading``.
 
-    In quarter turns it names the axes, else the angle.
+    It names the axes for quarter turns, else the angle.
     """
     R_body_cloud = rot_z(-heading) @ turning(AXES[axis], UP)
     forward = AXIS_NAMES[int(np.argmax(AXES @ R_body_cloud[0]))]
@@ -259,9 +259,9 @@ def turned_clouds(axis: int, heading: float) -> Reading:
 
 
 def axis_up(points: Points) -> int | None:
-    """Return the number of the axis of a cloud (N, 3) below whose negative end the ground lies; None without one.
+    """Return the number of the axis of a cloud (N, 3) that points up from the ground; None without ground.
 
-    A ceiling is a floor upside down, so z is asked first, also of a cloud in feet.
+    A ceiling is a floor upside down, so z is tried first, also for a cloud in feet.
     """
     found = []
     if not isinstance(ground_plane(points * np.float32(FOOT)), str):

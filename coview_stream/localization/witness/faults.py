@@ -1,21 +1,21 @@
 """Faults of clouds and odometry, and their probabilities, from the motions that odometry, clouds and map show.
 
-Over a step the odometry moves by o, the clouds, registered to each other, by l, and the registrations to the map by m.
-All three agree where nothing is wrong. A fault makes them disagree in a way of its own:
+Over a step odometry moves by o, the clouds, registered to each other, by l, and registrations to the map by m. All
+three agree if nothing is wrong. Each fault makes them disagree in its own way:
 
 * good: l = o; m = l in all cases, as the map sees the same clouds.
 * slip: o is wrong (wheels slip, odometry jumps), l is right, and smooth, as bodies have inertia.
 * stopped: o = 0 at any l; l is smooth.
-* scaled: l = s o along the way, with the heading as it was; l is right.
+* scaled: l = s o along the path, with the right heading; l is right.
 * repeated: l = 0 at any o.
-* late: l = o at an earlier time. The lag is constant, or grows: by and by, or steadily.
+* late: l = o at an earlier time. The lag is constant, or grows irregularly or steadily.
 * moved: the sensor was turned or shifted on the body by C, or the clouds come in another frame. Once l = o C, which no
   body does, and from then on l = C^-1 o C.
-* mixed: clouds of two places; half of the time l is anything, and most such clouds do not fit each other.
+* mixed: clouds of two places; half of the time l is arbitrary, and most such clouds do not fit each other.
 
-Each registration fails with a small probability and then says anything. The probabilities are those of a hidden Markov
-model: those before the step, moved by the rates at which faults come and go, times the likelihood of l and m (forward
-algorithm). A lag is a state of its own on a grid; each step begins a hypothesis about C, and the best are kept.
+Each registration fails with a small probability and is then arbitrary. A hidden Markov model gives the probabilities:
+those before the step, moved by the rates at which faults start and end, times the likelihood of l and m (forward
+algorithm). Each lag on a grid is a state; each step starts a hypothesis about C, and the best are kept.
 """
 
 from __future__ import annotations
@@ -42,49 +42,49 @@ from coview_stream.localization.witness.agreement import (
     unsure,
 )
 
-# how often faults come
-_PER_SECOND = 1e-6  # a driver hangs, a clock parts, a second driver starts: once in twelve days of driving
-_PAUSE = 60.0  # seconds that count of a pause: drivers and clocks fail while they run, or when they start again
+# rates of the faults
+_PER_SECOND = 1e-6  # a driver hangs, a clock drifts away, a second driver starts: once in twelve days of driving
+_PAUSE = 60.0  # seconds of a pause that count: drivers and clocks fail while they run or restart
 _PER_METRE = 1e-6  # a bolt gives way: once in 1000 km
-_FAST = 40.0  # metres per second: no robot is faster, clouds that cannot be registered may be
+_FAST = 40.0  # metres per second; no robot is faster, but clouds that cannot be registered may be
 _SLIPS = 0.01  # per metre: wheels slip once in 100 m
-_SLIPS_ON = 0.5  # probability that a slip lasts to the next step: wheels grip again within metres
-_STALLS = 1e-4  # share of holes in the stamps after which clouds are as late: mostly, clouds were dropped
-_ENDS = 0.01  # per second, that a fault of a driver or a clock ends: watchdogs start it anew within minutes
-_GROWS_ON = 0.95  # probability that a lag that grows does so in the next step: queues fill within some twenty seconds
+_SLIPS_ON = 0.5  # probability that a slip lasts until the next step: wheels grip again within metres
+_STALLS = 1e-4  # share of holes in the stamps after which clouds are late by the hole: mostly clouds were dropped
+_ENDS = 0.01  # per second: a fault of a driver or clock ends, as watchdogs restart them within minutes
+_GROWS_ON = 0.95  # probability that a growing lag grows in the next step: queues fill within some twenty seconds
 
 LAGS = np.arange(0.0, 3.01, 0.05)
-"""Lags of clouds, seconds; the first is none, the last is "as long or longer"."""
-_FASTEST = 0.5  # seconds per second by which a lag grows: a driver of half the speed
-_ALONG, _SIDEWAYS = 0.3, 0.1  # of the way: wheels that spin or lock, and that skid
-_SKID = np.array([0.1, 0.1, math.radians(3.0)])  # besides, within a step
-_JUMPS = ((0.08, 1.0), (0.015, 10.0), (0.005, 100.0))  # odometry may jump by anything: an estimator that starts anew
+"""Lags of clouds, seconds; the first is zero, the last means "as long or longer"."""
+_FASTEST = 0.5  # seconds per second, fastest growth of a lag: a driver at half speed
+_ALONG, _SIDEWAYS = 0.3, 0.1  # share of the path: wheels that spin or lock, and that skid
+_SKID = np.array([0.1, 0.1, math.radians(3.0)])  # in addition, within a step
+_JUMPS = ((0.08, 1.0), (0.015, 10.0), (0.005, 100.0))  # odometry may jump by anything, like a restarted estimator
 _SLIP_KINDS = (  # share, sigmas, and sigmas per metre of odometry
-    (0.5, np.array([0.03, 0.03, math.radians(0.5)]), np.array([_ALONG, 0.0, 0.0])),  # all wheels, along the way
-    (0.4, _SKID, np.array([0.2, _SIDEWAYS, 0.0])),  # some of the wheels, to a side
+    (0.5, np.array([0.03, 0.03, math.radians(0.5)]), np.array([_ALONG, 0.0, 0.0])),  # all wheels, along the path
+    (0.4, _SKID, np.array([0.2, _SIDEWAYS, 0.0])),  # some wheels, to a side
     *((share, np.minimum(times * ANYWHERE, [math.inf, math.inf, 1.8]), np.zeros(3)) for share, times in _JUMPS),
 )
 _INERTIA = np.array([2.0, 2.0, math.radians(60.0)])  # sigmas of the acceleration of a body, metres and radians per s^2
-_COPY = 1e-6  # probability that another cloud has the same bytes
-# points of a copy with noise stand where they stood, 0.9 of them, on a town, a campus and two real runs; of clouds that
-# moved on 0.01, also where rings or a corridor draw their registration to no motion. Neighbours err alike
+_COPY = 1e-6  # probability that another cloud has identical bytes
+# in copies with noise 0.9 of the points are unmoved, on a town, a campus and two real runs; in moving clouds 0.01, also
+# where rings or a corridor draw the registration to zero motion. Errors of neighbours are correlated
 _SAME_POINTS, _SAME_BY_CHANCE, _INDEPENDENT = 0.8, 0.05, 10.0
-_CHANGES = (  # sigmas of C: a mount gives way, a frame of another origin, one of other axes
+_CHANGES = (  # sigmas of C: a mount gives way, a frame with another origin, one with other axes
     np.array([0.1, 0.1, math.radians(10.0)]),
     np.array([3.0, 3.0, math.radians(3.0)]),
     np.array([0.1, 0.1, math.radians(100.0)]),
 )
-_SCALES = 0.5  # sigma of scales of odometry that are out by a fault: tyres, gears, units of half the size
-_KEPT = 5  # hypotheses about C, and about a scale
+_SCALES = 0.5  # sigma of wrong scales of odometry: tyres, gears, units of half the size
+_KEPT = 5  # kept hypotheses about C, and about a scale
 _EXACT = np.zeros((3, 3))
-_ON_BODY = 2.0  # metres: no mount shifts a sensor farther
-_TURNED = math.radians(2.0)  # of C, from which it is said to be a turn
-_NEGLIGIBLE = 1e-6  # probability below which a fault has not begun
+_ON_BODY = 2.0  # metres, largest shift of a sensor on its mount
+_TURNED = math.radians(2.0)  # of C, from which it is called a turn
+_NEGLIGIBLE = 1e-6  # probability below which a fault has not started
 
 
 @dataclass
 class _Moved:
-    """Hypothesis that clouds are moved by C (3,) since a step."""
+    """Hypothesis that clouds have been moved by C (3,) since a step."""
 
     weight: float
     C: Floats
@@ -98,7 +98,7 @@ class _Moved:
 
 @dataclass
 class _Scaled:
-    """Hypothesis that odometry is out of scale by a factor since a step: lidar and poses are right."""
+    """Hypothesis that odometry has been out of scale by a factor since a step, with lidar and poses right."""
 
     weight: float
     scale: float
@@ -112,20 +112,20 @@ class _Scaled:
 
 @dataclass
 class _Parting:
-    """Hypothesis that the clouds' clock has parted from odometry's since a step: their lag grows at a constant rate.
+    """Hypothesis that the clouds' clock has drifted from odometry's since a step: their lag grows at a constant rate.
 
-    On a straight way at a constant speed it looks as if odometry were out of scale. Turns tell the two apart, and the
-    stamps, which are as far apart as a lidar turns where they are right.
+    On a straight path at constant speed it looks like odometry out of scale. Turns separate the two, and so do the
+    stamps, whose correct spacing is the lidar's period.
     """
 
     weight: float
     rate: float  # seconds per second
     sigma: float
     lag: float  # seconds
-    seconds: float = 0.0  # since it began
+    seconds: float = 0.0  # since its start
 
     def beyond(self, lag: float) -> float:
-        """Return the probability that the clouds are later or earlier by more than ``lag`` seconds, if it is so."""
+        """Return the probability under the hypothesis that the clouds are off by more than ``lag`` seconds either way."""
         sigma = math.sqrt(2.0) * max(self.sigma * self.seconds, float(LAGS[1]) / 2.0)
         return 1.0 - 0.5 * (math.erf((lag - self.lag) / sigma) + math.erf((lag + self.lag) / sigma))
 
@@ -134,7 +134,7 @@ class _Parting:
         o, later = step.odometry.motion, self.lag + self.rate * step.seconds
         along = o * self.sigma
         spread = step.odometry.covariance + np.outer(along, along)
-        if later > LAGS[-1]:  # odometry so long ago is forgotten
+        if later > LAGS[-1]:  # odometry of so long ago is forgotten
             return o * [1.0 - self.rate, 1.0 - self.rate, 1.0], spread
         before, now = (
             np.array([np.interp(lag, LAGS, column) for column in path.T])
@@ -146,7 +146,7 @@ class _Parting:
         return between(before, now), spread
 
     def after(self, step: Step, likelihood: float) -> _Parting:
-        """Return the hypothesis after a step with a likelihood of its motions."""
+        """Return the hypothesis after a step with a ``likelihood`` of its motions."""
         longer, sigma = self.rate * step.seconds, self.sigma * step.seconds
         allowed = 1.0 if step.stamps is None else float(step.stamps.allow(np.array(longer), sigma))
         return replace(
@@ -158,9 +158,9 @@ class Accusation(NamedTuple):
     """A fault that may make poses wrong."""
 
     cause: RejectionReason
-    probability: float  # of all such faults
+    probability: float  # of all such faults together
     sentence: str
-    constant: bool = False  # of mount or clock, which the calibration can find
+    constant: bool = False  # constant fault of mount or clock, which the calibration can find
 
 
 @dataclass
@@ -171,15 +171,15 @@ class FaultPosterior:
     repeated: float = 0.0
     mixed: float = 0.0
     stopped: float = 0.0
-    steady: Floats = field(default_factory=lambda: np.eye(1, len(LAGS))[0])  # of each constant lag; the first: good
+    steady: Floats = field(default_factory=lambda: np.eye(1, len(LAGS))[0])  # of each constant lag; the first is good
     growing: Floats = field(default_factory=lambda: np.zeros(len(LAGS)))  # of each lag that grows
     moved: list[_Moved] = field(default_factory=list)
     scaled: list[_Scaled] = field(default_factory=list)
     parting: list[_Parting] = field(default_factory=list)
-    _driven: float = 0.0  # metres by odometry since the scan began to be repeated
-    _moved_on: float = 0.0  # metres by the clouds since odometry began to stand still
-    _speed: Floats = field(default_factory=lambda: np.zeros(3))  # of the newest step; the body's tilting turns it, too
-    _before: tuple[float, Floats, Floats] | None = None  # seconds, odometry and clouds of the step before
+    _driven: float = 0.0  # metres by odometry since the scan has been repeated
+    _moved_on: float = 0.0  # metres by the clouds since odometry has stood still
+    _speed: Floats = field(default_factory=lambda: np.zeros(3))  # of the newest step; includes the body's tilting
+    _before: tuple[float, Floats, Floats] | None = None  # seconds, odometry and clouds of the previous step
 
     @property
     def good(self) -> float:
@@ -188,16 +188,16 @@ class FaultPosterior:
 
     @property
     def odometry(self) -> float:
-        """Probability that odometry is wrong, and the lidar right."""
+        """Probability that odometry is wrong and the lidar right."""
         return self.slip + sum(h.weight for h in self.scaled)
 
     @property
     def sensors(self) -> float:
-        """Probability that a fault of the clouds, their stamps or odometry's goes on."""
+        """Probability of a present fault of the clouds, their stamps or odometry's."""
         return 1.0 - self.good - self.odometry
 
     def add(self, step: Step) -> None:
-        """Move the probabilities over a step (see the module)."""
+        """Update the probabilities by a step (see the module)."""
         o, dt = step.odometry.motion, step.seconds
         driven = float(np.linalg.norm(o[:2]))
         noise = step.odometry.covariance
@@ -205,7 +205,7 @@ class FaultPosterior:
         good, slip = self.good, self.slip
 
         def like(motion: Floats, spread: Floats = noise) -> Floats:
-            """Return the likelihood of the clouds' and the map's motion where this one is expected."""
+            """Return the likelihood of the clouds' and the map's motion, given this expected motion."""
             return likelihood(step, motion, spread, ALONE)
 
         anything = of_several_places(step)
@@ -215,29 +215,29 @@ class FaultPosterior:
         stands = driven < 3.0 * math.sqrt(float(noise[0, 0]))  # and sees copies
         copy = like(o) if stands else like(np.zeros(3)) * _copy_odds(step)
 
-        # faults that come from a good state or a slip, stay and go
+        # faults that start from the good state or a slip, continue and end
         farther = (
             driven if step.clouds is None else max(driven, min(dt * _FAST, float(np.hypot(*step.clouds.motion[:2]))))
         )
-        grips = math.exp(-_SLIPS * farther)  # under every hypothesis
+        grips = math.exp(-_SLIPS * farther)  # under each hypothesis
         begins = 1.0 - grips
         new_slip = (begins * good + _SLIPS_ON * slip) * slips
         new_repeated = (come * (good + slip) + (1.0 - ends) * self.repeated) * float(copy)
         new_stopped = 0.0
         if stands:
             new_stopped = (come * (good + slip) + (1.0 - ends) * self.stopped) * float(like(*self._going_on(step)))
-        both = 0.5 * (anything + float(like(o)))  # of the same place half of the time
+        both = 0.5 * (anything + float(like(o)))  # the same place half of the time
         new_mixed = (come * (good + slip) + (1.0 - ends) * self.mixed) * both
         back = (1.0 - _SLIPS_ON) * slip * float(like(o)) + ends * (self.repeated + self.mixed) * anything
         back += ends * self.stopped * float(like(o))
 
-        # lags: every pair of a lag before and one now
+        # lags: all pairs of a previous and a present lag
         motions = between(step.path_before[:, None], step.path_now)
         steady_spread, hidden = noise, unsure(step)
         if hidden is not None:
             steady_spread = noise + hidden[np.arange(len(LAGS)), np.arange(len(LAGS))]
         pairs = like(motions, noise + _grid_spread(o, dt) + (0.0 if hidden is None else hidden))
-        np.fill_diagonal(pairs, like(motions.diagonal().T, steady_spread))  # it is off by as much at both ends
+        np.fill_diagonal(pairs, like(motions.diagonal().T, steady_spread))  # with the same error at both ends
         pairs[0, 0], pairs[-1, -1] = like(o), 0.0
         if step.stamps is not None:
             pairs = pairs * step.stamps.allow(_LONGER)[_LONGER_OF]
@@ -249,7 +249,7 @@ class FaultPosterior:
         growing: Floats = grips * (grown @ (to_growing * pairs))
         steady[0] += back
 
-        # a sensor that has been moved stays so; the map has to see it move, too, as clouds of bare ground show anything
+        # a moved sensor stays moved; the map has to see the move, too, as clouds of bare ground show anything
         stays = grips * (1.0 - ends)
         moved = [replace(h, weight=stays * h.weight * float(like(*h.expected(o, noise)))) for h in self.moved]
         steady[0] += ends * sum(h.weight * float(like(compose(inverted(h.C), o))) for h in self.moved)
@@ -261,7 +261,7 @@ class FaultPosterior:
             moved.append(_Moved(weight, C, np.sqrt(np.diag(step.clouds.covariance + noise))))
         moved = sorted(moved, key=lambda h: -h.weight)[:_KEPT]
 
-        # nor does odometry mend its scale
+        # nor does a wrong scale of odometry correct itself
         scaled = [replace(h, weight=grips * h.weight * float(like(*h.expected(o, noise)))) for h in self.scaled]
         if step.clouds is not None and not stands:
             scale = float(step.clouds.motion[:2] @ o[:2]) / driven**2
@@ -271,7 +271,7 @@ class FaultPosterior:
             scaled.append(h)
         scaled = sorted(scaled, key=lambda h: -h.weight)[:_KEPT]
 
-        # and a clock that parts from another goes on so
+        # and a drifting clock continues to drift
         parting = [h.after(step, grips * float(like(*h.expected(step)))) for h in self.parting]
         if step.clouds is not None and not stands and 0.0 < 1.0 - scale < _FASTEST:
             new = _Parting(come * (good + slip) * sigma / _FASTEST, 1.0 - scale, sigma, 0.0)
@@ -280,7 +280,7 @@ class FaultPosterior:
 
         others = new_slip + new_repeated + new_mixed + new_stopped + steady.sum() + growing.sum()
         others += sum(h.weight for h in moved) + sum(h.weight for h in scaled) + sum(h.weight for h in parting)
-        longest = float(self.steady[-1] + self.growing[-1])  # predicts nothing: neither gains nor loses
+        longest = float(self.steady[-1] + self.growing[-1])  # predicts nothing, so it neither gains nor loses
         steady[-1] += longest * (1.0 - ends) * others / max(1.0 - longest, 1e-12)
         total = others + longest * (1.0 - ends) * others / max(1.0 - longest, 1e-12)
         self._before = None
@@ -299,14 +299,14 @@ class FaultPosterior:
             self._driven = self._driven + driven if self.repeated > _NEGLIGIBLE else 0.0
         if step.clouds is not None:
             metres = float(np.linalg.norm(step.clouds.motion[:2]))
-            moves = metres > 3.0 * math.sqrt(float(step.clouds.covariance[0, 0]))  # else both stand still: they agree
+            moves = metres > 3.0 * math.sqrt(float(step.clouds.covariance[0, 0]))  # else both stand still and agree
             self._moved_on = self._moved_on + metres if moves and self.stopped > _NEGLIGIBLE else 0.0
 
     def corrected(self, D: Floats, delay: float, factor: float = 1.0) -> None:
-        """Follow a calibration that has turned and shifted clouds by ``D`` (3,) and now takes them for later.
+        """Follow a calibration that has moved the clouds by ``D`` (3,) and changed delay and scale.
 
-        ``D`` is body <- the body's axes by the earlier calibration, ``delay`` the change of its delay, seconds,
-        ``factor`` that by which odometry is longer now.
+        ``D`` is body <- the body's axes by the earlier calibration, ``delay`` the increase of the delay, seconds,
+        ``factor`` the factor on odometry's distances.
         """
         self.scaled = [replace(h, scale=h.scale / factor, sigma=h.sigma / factor) for h in self.scaled]
         for h in self.moved:
@@ -317,14 +317,14 @@ class FaultPosterior:
             for lags in (self.steady, self.growing):
                 shares, place = lags.copy(), np.clip((LAGS - delay) / float(LAGS[1]), 0.0, len(LAGS) - 1.0)
                 if lags is self.steady:
-                    place[0] = 0.0  # the good state stays good by the new calibration
+                    place[0] = 0.0  # the good state stays good under the new calibration
                 below = np.minimum(place.astype(np.int64), len(LAGS) - 2)
                 lags[:] = 0.0
                 np.add.at(lags, below, (1.0 - place + below) * shares)
                 np.add.at(lags, below + 1, (place - below) * shares)
 
     def rescaled(self, risk: float) -> tuple[float, float] | None:
-        """Return the factor by which odometry is out of scale, and its sigma, if that is sure: good again."""
+        """Return the factor of odometry's wrong scale, and its sigma, once it is certain; the state is good again."""
         share = sum(h.weight for h in self.scaled)
         if share < 1.0 - risk:
             return None
@@ -334,7 +334,7 @@ class FaultPosterior:
         return best.scale, best.sigma
 
     def accusation(self, metres: float, radians: float, risk: float) -> Accusation | None:
-        """Return the most probable fault by which poses are off by more than a level, if all together reach a risk."""
+        """Return the most probable fault that puts poses off by more than a level, if all together reach a risk."""
         wrong: list[Accusation] = []
         if self._driven > metres:
             words = f"the lidar repeats itself: no motion between clouds while odometry drives {self._driven:.1f} m"
@@ -354,7 +354,7 @@ class FaultPosterior:
             wrong.append(Accusation(RejectionReason.CLOCK, share, words, True))
         speed, turning = float(np.linalg.norm(self._speed[:2])), float(self._speed[2])
         if self.parting:
-            longest = min(metres / max(speed, 1e-9), radians / max(turning, 1e-9))  # that a pose can be right with
+            longest = min(metres / max(speed, 1e-9), radians / max(turning, 1e-9))  # longest lag of a right pose
             share = sum(h.weight * h.beyond(longest) for h in self.parting)
             best = max(self.parting, key=lambda h: h.weight)
             words = f"clouds are {best.lag:.1f} s older than their stamps and more and more"
@@ -372,7 +372,7 @@ class FaultPosterior:
         return max(wrong, key=lambda each: each.probability)._replace(probability=total)
 
     def _going_on(self, step: Step) -> tuple[Floats, Floats]:
-        """Return the motion (3,) of a body that goes on as its clouds have moved, and its covariance (3, 3)."""
+        """Return the motion (3,) of a body that continues to move like its clouds, and its covariance (3, 3)."""
         if self._before is None:
             return step.odometry.motion, np.diag(ANYWHERE**2)
         seconds, _, seen = self._before
@@ -381,7 +381,7 @@ class FaultPosterior:
         return seen * share, np.diag(inertia**2) + covariance * share**2
 
     def _smoother(self, step: Step) -> float:
-        """Return how much better the clouds' motion goes on from the step before than odometry's, as a ratio."""
+        """Return the ratio by which the clouds' motion continues the previous step better than odometry's."""
         if self._before is None or step.clouds is None:
             return 1.0
         exponent, (seconds, driven, seen) = 0.0, self._before
@@ -396,7 +396,7 @@ class FaultPosterior:
 
 _LONGER = float(LAGS[1]) * np.arange(1.0 - len(LAGS), len(LAGS))
 _LONGER_OF = np.arange(len(LAGS))[None] - np.arange(len(LAGS))[:, None] + len(LAGS) - 1
-"""Seconds by which lags become longer, and their index for each pair of a lag before and one now."""
+"""Seconds by which lags increase, and their index for each pair of a previous and a present lag."""
 
 
 def _scale_density(scale: float) -> float:
@@ -404,7 +404,7 @@ def _scale_density(scale: float) -> float:
 
 
 def _copy_odds(step: Step) -> float:
-    """Return how much more probable the points of a step's clouds are if they are copies of each other."""
+    """Return the ratio by which copies explain the points of a step's clouds better than new clouds."""
     if step.copied or step.same is None:
         return 1.0 / _COPY if step.copied else 1.0
     share = step.same * math.log(_SAME_POINTS / _SAME_BY_CHANCE)
@@ -413,20 +413,20 @@ def _copy_odds(step: Step) -> float:
 
 
 def _grid_spread(o: Floats, dt: float) -> Floats:
-    """Covariance (3, 3) of a motion between lags of the grid, which is as coarse as it is."""
+    """Covariance (3, 3) of a motion between lags of the grid, by the grid's resolution."""
     return np.diag((o / dt * (LAGS[1] - LAGS[0])) ** 2 / 6.0)
 
 
 def _lag_rates(dt: float, come: float) -> tuple[Floats, Floats, Floats]:
-    """Return the transitions (L, L) between constant lags, from growing ones to constant ones, and among growing ones.
+    """Return the transitions (L, L) between constant lags, from growing to constant ones, and among growing ones.
 
-    The first row of the constant ones is the good state, from which any lag may come.
+    The first row of the constant ones is the good state, from which any lag may start.
     """
     n, ends = len(LAGS), 1.0 - math.exp(-_ENDS * dt)
     steady = (1.0 - ends) * np.eye(n)
     steady[1:, 0] = ends
     steady[0] = come / (n - 2)
-    steady[0, -1] = 0.0  # longer ones come by growing
+    steady[0, -1] = 0.0  # longer ones only arise by growing
     steady[0, 0] = 1.0 - 2.0 * come
     most = max(1, round(_FASTEST * dt / float(LAGS[1] - LAGS[0])))
     growth = np.triu(np.tri(n, k=most)) / (most + 1)

@@ -1,7 +1,7 @@
-"""The first motions of a robot, by its clouds alone, and its conventions by them.
+"""The first motions of a robot by its clouds alone, and its conventions from them.
 
 Clouds some metres apart are registered to each other, without a map and from many starts, so that odometry cannot hide
-a motion that it does not have.
+a motion that it lacks.
 """
 
 from __future__ import annotations
@@ -50,13 +50,13 @@ DOUBT = "odometry does not follow the first clouds: do both come in metres, x fo
 """Reason while :attr:`Conventions.doubtful`."""
 
 _LONGEST_CHAIN = 8  # clouds, where the robot hardly moves
-_STUCK = 0.05  # metres, that clouds of one place seem to have moved at most
-_NEW_START = 1.0  # metres from all other starts; a registration reaches three times as far
-_POINTS = 4000  # of a cloud, registered
-_ENOUGH, _SAME = 3, 0.2  # starts that reach the same motion, and metres between two that are the same
-_PAIRS = 6  # the newest, by which the localizer judges
-_ODD = math.log(1e-2)  # prior of a reading: of a hundred first set-ups one is wrong in one of these ways
-_ANY_HEADING = math.log(HEADING / math.pi)  # of one that is fitted: as one among all
+_STUCK = 0.05  # metres, largest apparent motion of clouds of one place
+_NEW_START = 1.0  # metres, spacing of starts; a registration reaches three times as far
+_POINTS = 4000  # registered per cloud
+_ENOUGH, _SAME = 3, 0.2  # starts that have to reach the same motion, and metres within which motions are the same
+_PAIRS = 6  # newest pairs, which the localizer judges
+_ODD = math.log(1e-2)  # log prior of a reading: one of a hundred first set-ups is wrong in one of these ways
+_ANY_HEADING = math.log(HEADING / math.pi)  # log prior of a fitted heading, as one among all
 
 
 class _Reached(NamedTuple):
@@ -74,7 +74,7 @@ class _Reached(NamedTuple):
 def _likeliest(found: list[_Reached], odometry: _Reached) -> tuple[float, Pose]:
     """Return the variance of the best determined motion, m2, and the motion (4, 4).
 
-    Other motions, odometry's too, widen it where the clouds fit as well, as far as counting tells.
+    Other motions, including odometry's, widen it as far as the clouds fit equally well, within counting errors.
     """
     chosen = min(found, key=lambda each: each.variance)
     weights = ((each, math.exp(-0.5 * (max(chosen.fit - each.fit, 0.0) / ALIKE) ** 2)) for each in (*found, odometry))
@@ -82,11 +82,11 @@ def _likeliest(found: list[_Reached], odometry: _Reached) -> tuple[float, Pose]:
 
 
 class CloudPairs:
-    """Motions of clouds, registered one to the next from many starts.
+    """Motions of successive clouds, registered from many starts.
 
     Of the motions that a registration reaches from all starts, the one that the clouds determine best counts: in 34 of
-    35 steps of riverside_a, kitti04 and handheld_livox it is the true one, with odometry's start and without. Others
-    that fit as well, as along a corridor, widen its sigma.
+    35 steps of riverside_a, kitti04 and handheld_livox it is the true one, with or without odometry's start. Others
+    that fit equally well, as along a corridor, widen its sigma.
     """
 
     def __init__(self, up: Floats) -> None:
@@ -104,7 +104,7 @@ class CloudPairs:
     def add(self, points: Points, T_odom_body: Pose) -> Pair | None:
         """Add a cloud (N, 3), metres, and its odometry (4, 4); return the motion since the pair's first, if far enough.
 
-        Shorter ones are added up.
+        Shorter motions are accumulated.
         """
         cloud, pair = voxelized(points, self._level, KeyframeConfig()), None
         found = None if self._target is None else self._registered(cloud, T_odom_body, self._target)
@@ -118,7 +118,7 @@ class CloudPairs:
         return pair
 
     def add_step(self, step: Pose, variance: float, T_before: Pose, T_odom_body: Pose) -> Pair | None:
-        """Add a motion (4, 4) between two clouds, its variance in m2, and odometry (4, 4) at both; return as above."""
+        """Add a motion (4, 4) between two clouds, its variance in m2, and odometry (4, 4) at both; as :meth:`add`."""
         if T_before is not self._newest:
             self._begin(T_before)
         self._target, self._newest = None, T_odom_body
@@ -153,10 +153,10 @@ class CloudPairs:
 
 
 def starts(before: Pose, after: Pose, step: Pose) -> Iterator[Pose]:
-    """Yield motions (4, 4) to begin a registration with, a metre or more apart.
+    """Yield motions (4, 4) to start a registration from, a metre or more apart.
 
-    They are odometry's as sent and mended, the one before, none, and odometry's distance in all directions, for a lidar
-    of any heading.
+    They are odometry's as sent and corrected, the previous one, none, and odometry's distance in all directions, for a
+    lidar of any heading.
     """
     odometry = inverse(before) @ after
     tried = [odometry, step, np.eye(4)]
@@ -175,12 +175,12 @@ def starts(before: Pose, after: Pose, step: Pose) -> Iterator[Pose]:
 
 
 class Conventions:
-    """Judge of a robot's conventions by its first motions.
+    """Check of a robot's conventions by its first motions.
 
     Attributes:
-        finding: why clouds and odometry are no use as they are sent, and the remedy; None while nothing is found.
-        plausible: they surely fit as they are sent; a straight drive may hide a mirror or odometry's wrong turns.
-        settled: they surely are as they should be.
+        finding: why clouds and odometry are unusable as sent, and the remedy; None while nothing is found.
+        plausible: they surely fit as sent; a straight drive may hide a mirror or odometry's wrong turns.
+        settled: they surely are correct.
         doubtful: not plausible yet, and odometry more probably does not follow the clouds.
     """
 
@@ -188,10 +188,10 @@ class Conventions:
         self.clear()
 
     def clear(self) -> None:
-        """Begin anew: another sender may speak."""
+        """Reset, as another sender may start."""
         self.finding: str | None = None
         self.plausible = self.settled = self.doubtful = False
-        self._at: Floats | None = None  # odometry's position at the newest cloud
+        self._at: Floats | None = None  # position by odometry at the newest cloud
         self._ups = Counter[int]()  # axes of the clouds below which ground was seen
         self._axis, self._unit = 0, 1.0
         self._motions: CloudPairs | None = None
@@ -199,7 +199,7 @@ class Conventions:
         self._pairs_in_feet: deque[Pair] = deque(maxlen=_PAIRS)
 
     def add(self, points: Points, T_odom_body: Pose) -> None:
-        """Judge one more cloud (N, 3) as it was sent, with its odometry (4, 4)."""
+        """Judge one more cloud (N, 3) as sent, with its odometry (4, 4)."""
         position = T_odom_body[:3, 3]
         if self.settled or (self._at is not None and float(np.linalg.norm(position - self._at)) < BASELINE):
             return
@@ -218,7 +218,7 @@ class Conventions:
         pair, in_feet = self._motions.add(points, T_odom_body), None
         if pair is not None:
             self._pairs.append(pair)
-        if fit(self._pairs).odds > 0.0:  # so clouds are not in feet
+        if fit(self._pairs).odds > 0.0:  # so the clouds are not in feet
             self._pairs_in_feet.clear()
             self._motions_in_feet = CloudPairs(AXES[axis])
         elif not self.plausible:
@@ -231,7 +231,7 @@ class Conventions:
     def add_motion(self, motion: Pose, variance: float, T_before: Pose, T_odom_body: Pose) -> None:
         """Judge a motion (4, 4) of clouds, its variance in m2, and odometry (4, 4) before and after it.
 
-        It was registered from odometry's, so it tells nothing before the two are plausible.
+        It was registered from odometry's motion, so it shows nothing before the two are plausible.
         """
         if not self.plausible or self.settled or self._motions is None:
             return
@@ -241,7 +241,7 @@ class Conventions:
             self._judge()
 
     def _judge(self) -> None:
-        """Weigh the readings, and that clouds and odometry have nothing to do with each other, by their odds."""
+        """Weigh the readings, and unrelated clouds and odometry, by their odds."""
         sent, unrelated = self._axis == 0 and self._unit == 1.0, _ODD
         weighed = sorted(
             ((prior + fit(self._pairs_in_feet if reading is FEET else self._pairs, reading).odds, reading)
@@ -264,7 +264,7 @@ class Conventions:
             self.finding = "; or else ".join(f"{each.found}: {each.remedy}" for each in rivals)
 
     def _readings(self, sent: bool) -> Iterator[tuple[float, Reading]]:
-        """Yield readings to compare, with their log priors; ``sent``: unit and vertical are as they should be."""
+        """Yield readings to compare, with their log priors; ``sent``: unit and vertical are correct."""
         if sent:
             yield 0.0, AS_SENT
         else:

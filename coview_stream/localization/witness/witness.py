@@ -1,4 +1,4 @@
-"""The witness of a robot's motion: clouds held against odometry and map, about once a metre or a second."""
+"""The witness of a robot's motion: compares clouds with odometry and map, about once a metre or a second."""
 
 from __future__ import annotations
 
@@ -38,15 +38,15 @@ from coview_stream.localization.witness.faults import LAGS, Accusation, FaultPos
 from coview_stream.localization.witness.first_motions import Conventions
 from coview_stream.localization.witness.stamps import step_stamps
 
-_METRES, _SECONDS, _TURN = 1.0, 1.0, np.radians(10.0)  # of a step, whichever comes first
-_SHORTEST = 0.3  # seconds of a step, as long as it is shorter than
+_METRES, _SECONDS, _TURN = 1.0, 1.0, np.radians(10.0)  # step limits, whichever comes first
+_SHORTEST = 0.3  # least seconds of a step that is shorter than
 _FAR = 5.0  # metres
-_MANY = 5  # frames of a step, which one more makes hardly longer
-_RECENT = 3  # frames of odometry of which the velocities are taken
-_SHORT = 0.05  # seconds: stamps nearer to each other are of one moment
+_MANY = 5  # frames of a step, to which one more makes little difference
+_RECENT = 3  # odometry frames that define the velocity
+_SHORT = 0.05  # seconds; closer stamps are of one moment
 _HISTORY = 600  # frames of odometry
 _HEADING = np.radians(1.0)  # sigma of the heading of the sensor on the body
-_RISK = 1e-3  # of a protection level
+_RISK = 1e-3  # of exceeding a protection level
 _JITTER = np.array([0.02, 0.02, np.radians(0.3)])  # sigma of odometry that stands still
 
 
@@ -55,13 +55,13 @@ class _Frame(NamedTuple):
     scan: RawScan
     T_odom_raw: Pose
     path: Floats  # (3,) planar pose by odometry, corrected
-    copied: bool  # it has the bytes of the one before
+    copied: bool  # it has the bytes of the previous frame
     number: int
     on_map: Estimate | None = None
 
 
 class _Waiting(NamedTuple):
-    """A comparison that waits for the next frame, as this one has had a registration to the map."""
+    """A comparison that waits for the next frame, as the present frame has already been registered to the map."""
 
     middle: _Frame | None
     now: _Frame
@@ -70,18 +70,18 @@ class _Waiting(NamedTuple):
 
 
 class Witness:
-    """Judge of one robot's clouds and odometry.
+    """Check of one robot's clouds and odometry.
 
     Attributes:
         faults: probabilities of the faults.
     """
 
     def __init__(self, config: RegistrationConfig, estimator: CalibrationEstimator) -> None:
-        """Judge with the calibration of ``estimator``, which is told to look for faults of mount and clock."""
+        """Use the calibration of ``estimator``, which is asked to look for faults of mount and clock."""
         self._estimator = estimator
-        # of a fault more probable than a slip, which would be taken for it
+        # cause of a constant fault more probable than a slip, which it resembles
         self._decided: RejectionReason | None = None
-        self._right_until: float | None = None  # stamp at which no fault of the clouds was probable yet
+        self._right_until: float | None = None  # newest stamp without a probable fault of the clouds
         self._meter = CloudMotionMeter(config)
         self.faults = FaultPosterior()
         self._path: deque[tuple[float, Floats]] = deque(maxlen=_HISTORY)  # stamp, planar pose by odometry, corrected
@@ -91,17 +91,17 @@ class Witness:
         self._previous: _Frame | None = None
         self._reference: _Frame | None = None
         self._waiting: _Waiting | None = None
-        self._tilting = 0.0  # radians per second of the body about its x and y, of late
+        self._tilting = 0.0  # recent rotation of the body about its x and y, radians per second
         self._calibration = Calibration()
         self._cloud: Points | None = None  # the newest
 
     def forget_scan(self) -> None:
-        """Compare the next frame with none before it: its scan is about another origin."""
+        """Keep the next frame from comparison with earlier ones, as its scan is about another origin."""
         self._reference = self._previous = self._newest = self._waiting = self._cloud = None
 
     def add(self, stamp: float, cloud: Points, scan: RawScan, T_odom_raw: Pose) -> None:
-        """Add a frame: its cloud (N, 3) as it came (its array may be filled anew), scan, and odometry (4, 4)."""
-        calibration = self._calibration  # the path is resized when a newer one is followed
+        """Add a frame: its raw cloud (N, 3), whose array may be reused, scan, and odometry (4, 4)."""
+        calibration = self._calibration  # the path is rescaled with each newer one
         pose = np.zeros(3)
         if self._odometry is not None:
             seconds = stamp - self._path[-1][0]
@@ -113,7 +113,7 @@ class Witness:
             step[2] += calibration.turn * float(np.linalg.norm(step[:2]))
             before = self._path[-1][1]
             pose = compose(before, step)
-            pose[2] = before[2] + step[2]  # not wrapped: it is interpolated
+            pose[2] = before[2] + step[2]  # not wrapped, as it is interpolated
         self._odometry = T_odom_raw
         self._path.append((stamp, pose))
         copied = self._cloud is not None and np.array_equal(self._cloud, cloud)
@@ -124,7 +124,7 @@ class Witness:
             self._reference = self._newest
 
     def while_searching(self, drift: Drift, conventions: Conventions | None = None) -> Accusation | None:
-        """Compare the newest frame if that is due; return the fault that would make a place wrong, if there is one.
+        """Compare the newest frame if due; return the fault that would make a place wrong, if any.
 
         ``conventions`` learn the motion too.
         """
@@ -138,14 +138,14 @@ class Witness:
         return self._accusation(0.5 * ALERT_METRES, 0.5 * ALERT_DEGREES)
 
     def between_registrations(self, tracker: Tracker) -> bool:
-        """Make the comparison that the last registration left; return whether a fault makes poses wrong."""
+        """Make the comparison left by the last registration; return whether a fault makes poses wrong."""
         return self._compare_waiting(tracker.odometry.drift) and self._accused(tracker) is not None
 
     def while_tracking(self, match: MapMatch, belief: Estimate | None, tracker: Tracker) -> MapMatch:
-        """Compare the newest frame if that is due; return its match, rejected where a fault makes poses wrong.
+        """Compare the newest frame if due; return its match, rejected if a fault makes poses wrong.
 
-        Where the match agrees with the pose, the comparison waits for the next frame (:meth:`between_registrations`).
-        ``belief`` is of its pose without the match, if there is a pose.
+        If the match agrees with the pose, the comparison waits for the next frame (:meth:`between_registrations`).
+        ``belief`` is the belief about the frame's pose without the match, if there is a pose.
         """
         fits = match.scan is not None and match.verdict.cause in (RejectionReason.VERIFIED, RejectionReason.ODOMETRY)
         registered = Estimate(match.T_map_body, match.covariance) if fits else None
@@ -164,15 +164,15 @@ class Witness:
         return replace(match, verdict=verdict, moves_place=follows)
 
     def _accused(self, tracker: Tracker) -> Accusation | None:
-        """Return the fault that makes the tracker's poses wrong by more than their level, if there is one."""
+        """Return the fault that puts the tracker's poses off by more than their level, if any."""
         level, decided = tracker.protection_level(), self._decided
         accused = self._accusation(min(level.horizontal, ALERT_METRES), min(level.degrees, ALERT_DEGREES))
         if self._decided is not decided:
-            tracker.odometry.forget_registration()  # of another mount or clock
+            tracker.odometry.forget_registration()  # it is of another mount or clock
         return accused
 
     def _accusation(self, metres: float, degrees: float) -> Accusation | None:
-        """Return the fault that probably makes poses wrong by more than a level; have the calibration look for it."""
+        """Return the fault that probably puts poses off by more than a level; have the calibration look for it."""
         accused, before = self.faults.accusation(metres, np.radians(degrees), _RISK), self._decided
         decided = accused is not None and accused.constant and accused.probability >= self.faults.odometry
         self._decided = accused.cause if decided and accused is not None else None
@@ -195,7 +195,7 @@ class Witness:
         return seconds >= _SECONDS or far >= _FAR or (moved and seconds >= _SHORTEST)
 
     def _may_hide_turns(self) -> bool:
-        """Return whether the step has many frames and an even number: of two drivers that take turns it shows one."""
+        """Return whether the step has many frames, an even number: of two alternating drivers it shows just one."""
         assert self._newest is not None
         assert self._reference is not None
         frames = self._newest.number - self._reference.number
@@ -222,10 +222,10 @@ class Witness:
 
         Args:
             now: the frame.
-            middle: the one before it.
+            middle: the frame before it.
             drift: of odometry.
-            registered: the frame's registration to the map, the prior removed, if it fits.
-            belief: of the frame's pose without it, if there is a pose.
+            registered: the frame's registration to the map, without the prior, if it fits.
+            belief: about the frame's pose without the registration, if there is a pose.
             contradicted: by the map, so the frame just before is compared, too: bodies do not jump.
             tracking: a place is known; a search has its own measurements between clouds for the calibration.
         """
@@ -247,7 +247,7 @@ class Witness:
         stamps = step_stamps(np.array([at for at, _ in self._path]), before.stamp, now.stamp)
         seen: CloudMotion | None = None
         guess = on_map.motion if contradicted and on_map is not None else None
-        if stamps.hole and guess is None:  # the cloud may be of the time before it
+        if stamps.hole and guess is None:  # the cloud may be from before the hole
             guess = between(past[0], self._by_lags(now.stamp - delay - stamps.hole)[0])
         if driven <= LONGEST or (guess is not None and float(np.linalg.norm(guess[:2])) <= LONGEST):
             seen = self._meter.measure(before.scan, now.scan, calibration, guess)
@@ -268,12 +268,12 @@ class Witness:
         if self.faults.good + self.faults.odometry > 0.5:
             self._right_until = now.stamp
         if self._decided in (RejectionReason.MOUNT, RejectionReason.CLOCK) and seen is not None and tracking:
-            # nothing else tells the new mount or clock: registrations to the map are not believed meanwhile
+            # only this shows the new mount or clock, as registrations to the map are not believed meanwhile
             spread = seen.covariance + np.diag(_JITTER**2 + [x, y, yaw])
             moments = before.scan.moment, now.scan.moment
             self._estimator.measure_motion(np.eye(4), spatial(seen.motion), spatial(o), spread, moments)
         if (rescaled := self.faults.rescaled(_RISK)) is not None:
-            learned = (1.0 + self._estimator.calibration.scale) / (1.0 + calibration.scale)  # in this step already
+            learned = (1.0 + self._estimator.calibration.scale) / (1.0 + calibration.scale)  # already in this step
             self._estimator.rescale(rescaled[0] / learned, rescaled[1] / learned)
         self._reference = now
         return seen
@@ -281,7 +281,7 @@ class Witness:
     def _parts(
         self, seen: CloudMotion, before: _Frame, middle: _Frame | None, now: _Frame, calibration: Calibration
     ) -> tuple[tuple[float, Floats, Floats], ...]:
-        """Return a step's motions before and since its last frame but one: seconds, odometry, clouds."""
+        """Return a step's motions up to and since its last frame but one: seconds, odometry, clouds."""
         if middle is None or not before.stamp < middle.stamp < now.stamp:
             return ()
         last = self._meter.measure(middle.scan, now.scan, calibration)
@@ -294,12 +294,12 @@ class Witness:
         )
 
     def _follow(self) -> Calibration:
-        """Take over a changed calibration; return it."""
+        """Adopt a changed calibration; return it."""
         calibration = self._estimator.calibration
         moved = calibration.T_body_cloud @ inverse(self._calibration.T_body_cloud)
         factor = (1.0 + calibration.scale) / (1.0 + self._calibration.scale)
         self.faults.corrected(planar_pose(moved), calibration.delay - self._calibration.delay, factor)
-        if factor != 1.0:  # all steps of odometry are of one scale
+        if factor != 1.0:  # all steps of odometry share one scale
             here, resized = self._path[-1][1], np.array([factor, factor, 1.0])
             self._path = deque(((at, here + resized * (pose - here)) for at, pose in self._path), maxlen=_HISTORY)
         self._calibration = calibration
@@ -308,8 +308,8 @@ class Witness:
     def _by_lags(self, stamp: float) -> Floats:
         """Return odometry's planar poses (L, 3) by LAGS before a stamp.
 
-        Before the first frame it stood still, after the newest it goes on as before. Within holes in odometry it
-        goes from the speed before to the one after.
+        Odometry stands still before the first frame and continues at its velocity after the newest. Within holes its
+        speed changes from the one before to the one after.
         """
         stamps = np.array([at for at, _ in self._path])
         poses = np.stack([pose for _, pose in self._path])
@@ -324,7 +324,7 @@ class Witness:
         return smoothly_between(at, stamps, poses)
 
     def _unsure(self, stamp: float) -> Floats:
-        """Return half of the products (L,) of the seconds to the frames of odometry before and after, by LAGS."""
+        """Return half the products (L,) of the seconds to the odometry frames before and after, by LAGS."""
         stamps = np.array([at for at, _ in self._path])
         at = np.clip(stamp - LAGS, stamps[0], stamps[-1])
         after = np.clip(np.searchsorted(stamps, at), 1, len(stamps) - 1)
@@ -332,7 +332,7 @@ class Witness:
 
 
 def _contradicts(o: Floats, noise: Floats, seen: CloudMotion) -> bool:
-    """Return whether the clouds' motion is one that odometry's errors explain once in a thousand."""
+    """Return whether odometry's errors explain the clouds' motion only once in a thousand."""
     gap = between(o, seen.motion)
     return float(gap @ np.linalg.solve(noise + seen.covariance, gap)) > chi2_quantile(3, _RISK)
 
