@@ -1,7 +1,7 @@
 """Configuration: frozen dataclasses with validated ranges, paper defaults and named presets.
 
-Lengths in metres, angles in radians. What shapes the map's descriptors (:class:`DescriptorConfig`) is stored in
-the map and read back from it, so that the two can never drift apart; the rest belongs to the localizer.
+Lengths in metres, angles in radians. Settings of the map's descriptors (:class:`DescriptorConfig`) are stored in the
+map and read back from it, so that the two never drift apart; the rest belongs to the localizer.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""Range checks of configuration fields, made when a configuration is; the message names field, value and range."""
+"""Range checks of configuration fields at construction; the message names field, value and range."""
 
 from __future__ import annotations
 
@@ -16,14 +16,14 @@ Config = TypeVar("Config")
 
 
 def require(ok: bool, config: object, name: str, allowed: str) -> None:
-    """Raise :class:`ConfigError`, naming the field, its value and what is ``allowed``, unless ``ok``."""
+    """Raise :class:`ConfigError`, with the field, its value and the ``allowed`` range, unless ``ok``."""
     if not ok:
         value = getattr(config, name)
         raise ConfigError(f"{name} is {value!r}; it must be {allowed} ({type(config).__name__}.{name})")
 
 
 def names_parts(kind: type[Config]) -> type[Config]:
-    """Have a configuration of configurations refuse a field that one of these has, with its place (ConfigError)."""
+    """Let a configuration of configurations refuse a field that one of these has, and name its place (ConfigError)."""
     made = kind.__init__
 
     @functools.wraps(made)
@@ -72,7 +72,7 @@ def positive(config: object, *names: str) -> None:
 
 
 def all_positive(config: Any, *but: str) -> None:
-    """Refuse a configuration with a field, other than those named, that is not positive and finite."""
+    """Refuse a configuration with a field, other than those in ``but``, that is not positive and finite."""
     positive(config, *(f.name for f in fields(config) if f.name not in but))
 
 

@@ -1,4 +1,4 @@
-"""All of the localizer's settings together."""
+"""All settings of the localizer."""
 
 from __future__ import annotations
 
@@ -9,13 +9,13 @@ from typing import Literal, get_args
 from coview_stream.config.checks import all_positive, check_types, counts, fraction, names_parts, positive, require
 
 MIN_PAIRS = 50
-"""Pairs that a registration needs, and points that a crop of the map needs."""
+"""Least number of pairs for a registration, and of points in a crop of the map."""
 
 MAX_DELAY = 1.0
-"""Seconds between the clocks of clouds and odometry, the most that are searched for."""
+"""Largest delay between the clocks of clouds and odometry that is searched for, seconds."""
 
 LEAST_RISK = 1e-6
-"""Smallest risk: the model of the evidence does not tell smaller errors apart."""
+"""Smallest risk: the model of the evidence does not resolve smaller errors."""
 
 
 @dataclass(frozen=True)
@@ -30,8 +30,8 @@ class AcceptanceConfig:
         max_tilt: radians by which a pose may lean against gravity.
         max_innovation: squared Mahalanobis distance to odometry's prediction, 6 degrees of freedom, above which the
             pose is withheld. Exact covariances exceed 22 once in a thousand; ours have heavier tails.
-        max_doubt_s: seconds of doubt after which the map is searched again.
-        max_blind_s: the same while the sensor is blind: odometry goes on, and nothing contradicts the place.
+        max_doubt_s: seconds of doubt after which the map is searched.
+        max_blind_s: the same while the sensor is blind: odometry continues, and nothing contradicts the place.
     """
 
     risk: float = 1e-4
@@ -50,25 +50,26 @@ class AcceptanceConfig:
 class RegistrationConfig:
     """Trimmed ICP (eq. 13): point-to-plane, coarse to fine.
 
-    Points above the ground and points on it are trimmed apart, for the ground fits anywhere; ``python -m bench ablation
-    --only registration`` has them together, too, and other values of ``keep`` and ``iterations``.
+    Points above the ground and points on it are trimmed separately, as the ground fits anywhere; ``python -m bench
+    ablation --only registration`` also trims them together, and tries other values of ``keep`` and ``iterations``.
 
     ``inflation`` is calibrated by ``python -m bench tracking --seeds 5100``, ``shared`` by ``python -m bench
     covariance`` on kitti04 and simulated towns, with the other real runs in view. The rest is set by hand.
 
     Attributes:
-        keep: overlap, the share of the pairs that the last scale keeps, the nearest; the paper keeps 0.6. The scales
-            before it keep all: far from the end the nearest pairs are those that hold a wrong pose.
+        keep: overlap, the share of nearest pairs that the last scale keeps; the paper keeps 0.6. Earlier scales keep
+            all, as far from convergence the nearest pairs support a wrong pose.
         search: largest correspondence distances of the successive scales of a search, metres, coarse to fine.
         track: likewise while tracking.
-        iterations: at most, on each scale.
-        source_voxel: metres; one point of the scan is kept in each cube of this size.
-        source_points: at most so many of them, chosen at random.
+        iterations: limit per scale.
+        source_voxel: metres; one point of the scan is kept per cube of this size.
+        source_points: limit on their number; the choice is random.
         source_range: metres from the sensor within which the scan's points are used.
-        inflation: times the inverse Hessian's sigma, which is optimistic: neighbouring points are not independent.
-        shared: times the clustered sigma of the error that neighbouring registrations have in common, because the
-            map's parts and the scan's disagree by centimetres.
-        gravity_sigma: radians by which odometry's vertical may be off, each of roll and pitch; a prior of searches.
+        inflation: factor on the inverse Hessian's sigma, which is optimistic, as neighbouring points are not
+            independent.
+        shared: factor on the clustered sigma of the error shared by neighbouring registrations, as parts of map and
+            scan disagree by centimetres.
+        gravity_sigma: sigma of odometry's vertical, radians, for roll and pitch each; a prior of searches.
     """
 
     keep: float = 0.7
@@ -98,11 +99,11 @@ class KeyframeConfig:
     """Keyframes: when the robot's frames become a virtual local scan, VLS (of the paper); set by hand.
 
     Attributes:
-        distance: metres driven from keyframe to keyframe, the paper's sigma_d.
-        capacity: keyframes held, so that memory is fixed.
-        voxel: metres; one point of a frame is kept in each cube of this size.
+        distance: metres driven between keyframes, the paper's sigma_d.
+        capacity: number of keyframes kept, which bounds memory.
+        voxel: metres; one point of a frame is kept per cube of this size.
         range_min: metres; nearer points are the robot itself.
-        min_points: points, after that, which a VLS needs before it may vote.
+        min_points: points left that a VLS needs to vote.
     """
 
     distance: float = 2.0
@@ -123,10 +124,10 @@ class ConsensusConfig:
     """Consensus: the votes of keyframes for one ``T_map_odom``; set by hand.
 
     Attributes:
-        window: newest keyframes that vote.
-        peaks: best hypotheses that are scored by the likelihood field; more of the co-view descriptors on maps of
-            more than 20,000 stations, by the fourth root.
-        distinct_distance: metres; a hypothesis farther than this from every better one is one of its own.
+        window: number of newest keyframes that vote.
+        peaks: number of best hypotheses that the likelihood field scores; above 20,000 stations that of the co-view
+            descriptors grows by the fourth root.
+        distinct_distance: metres; a hypothesis farther than this from all better ones is distinct.
         distinct_yaw: radians; so is one turned by more than this.
     """
 
@@ -142,7 +143,7 @@ class ConsensusConfig:
 
 
 Reloc = Literal["auto", "coview", "learned"]
-"""Place recognition: the descriptors of the paper, learned features, or (auto) both where map and installation can."""
+"""Place recognition: the paper's descriptors, learned features, or (auto) both where map and installation allow."""
 
 
 @dataclass(frozen=True)
@@ -152,11 +153,11 @@ class LearnedConfig:
     Set by hand; ``python -m bench forest`` prints the places that it finds.
 
     Attributes:
-        reach: metres around the robot's newest position, horizontally, within which its keyframes' points are used.
-        cell: metres from place to place at which their features are compared with the map's.
-        dense_area: square metres up to which a map is searched all over.
-        shortlist: tiles of a larger one, those that look most alike, around which it is searched.
-        peaks: best places that are scored by the likelihood field.
+        reach: horizontal metres around the robot's newest position within which its keyframes' points are used.
+        cell: spacing in metres of the places at which features are compared with the map's.
+        dense_area: square metres up to which a whole map is searched.
+        shortlist: number of most similar tiles around which a larger map is searched.
+        peaks: number of best places that the likelihood field scores.
     """
 
     reach: float = 30.0
@@ -175,30 +176,30 @@ class LearnedConfig:
 
 @dataclass(frozen=True)
 class TrackingConfig:
-    """Registrations while tracking: when, with which frames; and the drift that odometry is believed to have.
+    """Registrations while tracking: when and with which frames; and the presumed drift of odometry.
 
-    A registration is due after ``distance``, ``turn`` or ``seconds``, and sooner where odometry is so bad that the pose
-    has become uncertain. ``seconds`` counts regardless of odometry: wheels slip, drivers hang, robots are carried.
+    A registration is due after ``distance``, ``turn`` or ``seconds``, and sooner if poor odometry has made the pose
+    uncertain. ``seconds`` counts regardless of odometry: wheels slip, drivers hang, robots are carried.
 
-    The newest frame is registered, with as many earlier ones as it takes to reach ``min_points``. Drift smears older
-    frames: ``python -m bench ablation --only localizer`` registers those of two metres, too.
+    The newest frame is registered, with earlier ones added until there are ``min_points``. Drift smears older frames:
+    ``python -m bench ablation --only localizer`` also registers those of two metres.
 
-    Drifts are sigmas of a random walk per square root of a metre driven, with which the drift estimator begins before
-    it measures them. All are set by hand.
+    Drifts are sigmas of a random walk per square root of a metre driven, from which the drift estimator starts. All
+    are set by hand.
 
     Attributes:
         distance: metres driven.
         seconds: of sensor time.
         window: metres; no frame older than this is added once there are ``min_points``.
         min_points: see above.
-        max_points: no frame is added once there are so many.
+        max_points: no frame is added once there are this many.
         turn: radians turned.
         position_drift: metres, each of x and y.
         height_drift: metres.
         tilt_drift: radians, each of roll and pitch.
         yaw_drift: radians.
         turn_drift: radians of yaw per radian turned.
-        drift_prior: metres of driving that these rates count like beside the measured ones.
+        drift_prior: weight of these rates against the measured ones, metres of driving.
     """
 
     distance: float = 1.0
@@ -232,13 +233,13 @@ class LocalizerConfig:
         acceptance: limits of a fix.
         tracking: registrations while tracking.
         learned: look-up of learned features.
-        reloc: place recognition, see :data:`coview_stream.config.Reloc`; ``auto`` goes without learned features where
+        reloc: place recognition, see :data:`coview_stream.config.Reloc`; ``auto`` does without learned features where
             the map lacks them or has those of other weights.
-        sensor_leans: estimate a lean of the sensor against odometry's gravity; False for odometry made of the sensor's
-            own clouds, whose frame leans with the sensor.
-        cloud_delay: seconds that clouds are stamped later than odometry, from -1 to 1, if known: estimated from there.
-            Negative where odometry is late.
-        mount_drawn: heading and place of the lidar on the body are as in a drawing; False where they are guessed
+        sensor_leans: estimate a lean of the sensor against odometry's gravity; False for odometry computed from the
+            sensor's own clouds, whose frame leans with the sensor.
+        cloud_delay: seconds by which clouds are stamped later than odometry, from -1 to 1, if known; start of its
+            estimate. Negative where odometry is late.
+        mount_drawn: heading and place of the lidar on the body are taken from a drawing; False if guessed
             (:attr:`coview_stream.config.mount.Mount.drawn`): estimated, and in covariances until motion shows them.
     """
 

@@ -13,25 +13,25 @@ Channel = Literal["scan_context", "coview", "paper"]
 Preset = Literal["slam", "tls"]
 
 
-_FINEST = 0.01  # metres: finer than any laser scanner measures, and 10,000 km of it are still counted in int32
+_FINEST = 0.01  # metres: finer than any laser scanner, and int32 still counts 10,000 km of it
 
 
 @dataclass(frozen=True)
 class DescriptorConfig:
     """Polar descriptor of a virtual scan (paper, eqs 1-4); set by hand where the paper gives no value.
 
-    Stored in the map and read back from it, so that map and robot cannot drift apart. A map may come from anyone:
-    ranges keep the work for a station within ten times that of the defaults.
+    It is stored in the map and read back from it, so that map and robot never drift apart. As a map may come from
+    anyone, ranges limit the work per station to ten times that of the defaults.
 
     Attributes:
-        radius: metres that a descriptor reaches; the paper's; at most 200.
-        rings: bins along it, 80 at most; at most 4,800 in all sectors.
+        radius: metres that a descriptor reaches, at most 200; the paper's.
+        rings: bins along the radius, at most 80; at most 4,800 in all sectors.
         sectors: bins around; a shift by one is a turn by 2 pi / ``sectors``.
         channels: descriptors that vote together: ``scan_context``, the greatest heights of all bins; ``coview``, those
             of co-visible bins; ``paper``, eqs 1-4 as printed. ``python -m bench ablation`` compares them.
-        voxel: metres; one point is kept in each cube of it.
-        ground_zero: measure the keyframe's heights from the ground below the robot, as the map's are, not from the
-            sensor; ``python -m bench ablation`` has both.
+        voxel: metres; one point is kept per cube of this size.
+        ground_zero: measure a keyframe's heights from the ground below the robot, as the map's are, not from the
+            sensor; ``python -m bench ablation`` compares both.
     """
 
     radius: float = 50.0
@@ -62,14 +62,14 @@ class MapConfig:
     Attributes:
         descriptor: of the stations.
         block: metres between stations, a multiple of 0.5.
-        voxel: metres; one point is stored for each cube of this size.
+        voxel: metres; one point is stored per cube of this size.
         tile: metres, size of the tiles by which points are sorted.
         outlier_neighbours: of each point, for the statistical outlier filter; 0 switches it off.
         outlier_std_ratio: standard deviations of their mean distance beyond which a point is removed.
-        normal_radius: metres within which a point's neighbours make its normal.
-        normal_neighbours: how many of them at most.
-        levels: a station for every floor of a building above the ground, too.
-        learned: also store the features that learned re-localization needs.
+        normal_radius: metres within which neighbours define a point's normal.
+        normal_neighbours: limit on their number.
+        levels: also put a station on every floor of a building above the ground.
+        learned: also store the features for learned re-localization.
     """
 
     descriptor: DescriptorConfig = field(default_factory=DescriptorConfig)
@@ -90,14 +90,14 @@ class MapConfig:
         counts(self, "normal_neighbours", minimum=3, maximum=1000)
         require(1.0 <= self.tile <= 1280.0, self, "tile", "of 1 to 1280 m")
         require(self.voxel >= _FINEST, self, "voxel", f"at least {_FINEST} m")
-        halves = self.block / 0.5  # stations must stand at the centres of the raster's cells
+        halves = self.block / 0.5  # stations must be at the centres of the raster's cells
         require(abs(halves - round(halves)) < 1e-6, self, "block", "a multiple of 0.5 m")
         require(self.voxel <= self.block, self, "voxel", f"no larger than block ({self.block} m)")
         require(self.block < self.descriptor.radius, self, "block", f"below the radius ({self.descriptor.radius} m)")
 
 
 def map_preset(name: Preset, **changes: Any) -> MapConfig:
-    """Return one of the paper's two settings: ``slam`` (radius 50 m) and ``tls`` (terrestrial scans, radius 100 m).
+    """Return one of the paper's two settings: ``slam`` (radius 50 m) or ``tls`` (terrestrial scans, radius 100 m).
 
     ``changes`` are fields of :class:`MapConfig` or :class:`DescriptorConfig` that replace the preset's. Raises
     :class:`ConfigError` for an unknown preset or field, or a value out of range.
@@ -121,17 +121,17 @@ def map_preset(name: Preset, **changes: Any) -> MapConfig:
 
 
 _BUILT_IN = {"visibility": "paper", "eye": 1.5}
-"""Descriptor options that only earlier versions had, which their files name, and the value that is built in now."""
+"""Descriptor options of earlier versions only, named in their files, and the value that is now built in."""
 
 
 def config_of_map(plain: Mapping[str, Any]) -> MapConfig:
-    """Return the settings that a map's file holds as plain data.
+    """Return the settings that a map's file stores as plain data.
 
     Raises:
-        ConfigError: a value is out of range. KeyError, TypeError, ValueError: it is no such data.
+        ConfigError: a value is out of range. KeyError, TypeError, ValueError: the data are something else.
     """
     fields_of_map = dict(plain)
-    fields_of_map.setdefault("learned", False)  # maps older than this field
+    fields_of_map.setdefault("learned", False)  # for maps older than this field
     descriptor = dict(fields_of_map.pop("descriptor"))
     descriptor["channels"] = tuple(descriptor["channels"])
     for name, only in _BUILT_IN.items():

@@ -12,13 +12,13 @@ from coview_stream.errors import ConfigError, counted
 from coview_stream.geometry.arrays import Floats
 from coview_stream.geometry.transforms import Points, Pose, exp_so3, pose_from, rot_z, transform
 
-MAX_LEVER = 100.0  # metres from the body's origin to the sensor; farther is another unit
-_UPRIGHT = math.sin(math.radians(0.05))  # cosine of a pitch of 90 degrees, as an option has it
+MAX_LEVER = 100.0  # metres from the body's origin to the sensor; more means another unit
+_UPRIGHT = math.sin(math.radians(0.05))  # cosine of a pitch of 90 degrees at the resolution of an option
 
 
 @dataclass(frozen=True)
 class Mount:
-    """Where a lidar sits and how it is turned: T_body_sensor, body x forward and z up.
+    """Position and orientation of a lidar: T_body_sensor, body x forward and z up.
 
     Points are rolled about the body's x first, then pitched about its y (positive: nose down), then turned about its z.
 
@@ -29,8 +29,8 @@ class Mount:
         x: metres forward of the body's origin.
         y: metres to its left.
         z: metres above it.
-        drawn: heading and place are as in a drawing, to 0.1 degrees and 5 mm. Else, as where only angles are stated,
-            the heading is a guess and the place is not known.
+        drawn: heading and place are taken from a drawing, to 0.1 degrees and 5 mm. Else, as with angles alone, the
+            heading is a guess and the place is unknown.
     """
 
     roll: float = 0.0
@@ -55,15 +55,15 @@ class Mount:
         return pose_from(rot_z(self.yaw) @ pitched, [self.x, self.y, self.z])
 
     def turned(self, R: Floats) -> Mount:
-        """Return the mount of this lidar if its clouds in the body frame have to be turned by ``R`` (3, 3) as well."""
+        """Return the mount of this lidar if its clouds in the body frame need a further rotation ``R`` (3, 3)."""
         return self.moved(pose_from(R, np.zeros(3)))
 
     def moved(self, T_body_cloud: Pose) -> Mount:
-        """Return the mount of this lidar if its clouds in the body frame have to be moved by a pose (4, 4) as well."""
+        """Return the mount of this lidar if its clouds in the body frame need a further motion by a pose (4, 4)."""
         T = T_body_cloud @ self.T_body_sensor
         roll, pitch = math.atan2(T[2, 1], T[2, 2]), -math.asin(max(-1.0, min(1.0, float(T[2, 0]))))
         yaw = math.atan2(T[1, 0], T[0, 0])
-        if math.cos(pitch) < _UPRIGHT:  # roll and yaw are about one axis
+        if math.cos(pitch) < _UPRIGHT:  # roll and yaw share an axis
             roll, yaw = 0.0, math.atan2(-T[0, 1], T[1, 1])
         x, y, z = T[:3, 3].tolist()
         return Mount(roll, pitch, yaw, x, y, z, self.drawn)
@@ -75,14 +75,14 @@ class Mount:
 
     @property
     def option(self) -> str:
-        """Text that :func:`parse_mount` reads, to a tenth of a degree and a centimetre."""
+        """Text for :func:`parse_mount`, to a tenth of a degree and a centimetre."""
         angles = [round(math.degrees(angle), 1) for angle in (self.roll, self.pitch, self.yaw)]
         metres = [round(m, 2) for m in (self.x, self.y, self.z)]
         stated = any(metres) or (self.drawn and any(angles))
         return ",".join(f"{number + 0.0:g}" for number in angles + metres * stated)
 
     def to_body(self, points: Points) -> Points:
-        """Return a cloud (N, 3), sensor frame, metres, in the body frame; the cloud itself where they are one."""
+        """Return a cloud (N, 3), sensor frame, metres, in the body frame; the cloud itself if the frames coincide."""
         if replace(self, drawn=True) == Mount():
             return points
         with np.errstate(invalid="ignore", over="ignore"):  # missing returns may be infinite
@@ -90,7 +90,7 @@ class Mount:
 
 
 def parse_mount(text: str) -> Mount:
-    """Read the value of an option, ``roll,pitch,yaw[,x,y,z]`` in degrees and metres; ConfigError for another text.
+    """Read the value of an option, ``roll,pitch,yaw[,x,y,z]`` in degrees and metres; ConfigError for other text.
 
     Angles alone are not ``drawn``, unless all are 0.
     """

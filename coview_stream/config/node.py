@@ -8,7 +8,7 @@ from coview_stream.config.checks import all_positive, check_types, require
 from coview_stream.config.mount import Mount
 
 METRICS_ADDRESS = "127.0.0.1:9464"
-"""Where metrics can be read over HTTP unless another address is named; the port of OpenTelemetry's exporters."""
+"""Default HTTP address of the metrics; the port of OpenTelemetry's exporters."""
 
 
 @dataclass(frozen=True)

@@ -16,7 +16,7 @@ Gravity = Literal["ground", "level"] | tuple[float, float, float]
 """Direction of down: estimated from the ground, along the body's -z, or a vector in the body frame (any length)."""
 
 MAX_TILT = math.radians(60.0)
-"""Radians from upright; a body frame has z up (x forward), so one that leans more is a mistake."""
+"""Radians from upright; a body frame has z up (x forward), so a larger lean is a mistake."""
 
 
 @dataclass(frozen=True)
@@ -30,10 +30,10 @@ class LidarOdometryConfig:
         max_range: metres; farther points are left out.
         voxel: edge of the local map's voxels, metres.
         min_points: points between the two ranges; a frame with fewer is not placed.
-        max_gap: seconds without a usable frame after which a new local map begins at the last frame's pose: the motion
-            since is unknown.
-        max_speed: metres per second; a faster registration is refused, and a new local map begins.
-        keep_level: correct drift and registration's errors of roll and pitch by the walls and the ground around.
+        max_gap: seconds without a usable frame after which a new local map starts at the last frame's pose, as the
+            motion since is unknown.
+        max_speed: metres per second; a faster registration is refused, and a new local map starts.
+        keep_level: correct drift and registration errors of roll and pitch by the walls and the ground around.
         threads: threads of kiss-icp.
     """
 

@@ -28,7 +28,7 @@ def read_settings(path: Path) -> dict[str, Any]:
 
 
 def with_table(config: T, table: Mapping[str, Any], where: str) -> T:
-    """Return a configuration with the fields of a table; a field that is a configuration takes a table of its own.
+    """Return a configuration with the fields of a table; a field that is a configuration takes its own table.
 
     ``where`` names file and table in the ConfigError of an unknown key, or of a value of another type or out of range.
     """
@@ -53,5 +53,5 @@ def with_table(config: T, table: Mapping[str, Any], where: str) -> T:
 
 
 def unknown_key(key: str, known: list[str]) -> str:
-    """Return the message about a key that a table does not have, with its nearest known one."""
+    """Return the message about an unknown key of a table, with the nearest known one."""
     return f"unknown key {key!r}; {did_you_mean(key, known)}"

@@ -23,20 +23,20 @@ SLABS = (0.5, 1.0, 2.0, 4.0, 7.0, 11.0, 16.0, 22.0, 40.0)
 """Bounds of the height layers, metres above the ground."""
 
 LAYERS = len(SLABS) + 2
-"""One for each pair of bounds, then the greatest height, the cells with ground points, and the relief of the ground."""
+"""One per pair of bounds, then the greatest height, the cells with ground points, and the relief of the ground."""
 
 BIRDS_EYE_VIEW_VERSION = 1
-"""Raise it when the same cloud gives another image: features are comparable only between equal versions."""
+"""To be raised when a cloud's image changes: features are comparable only between equal versions."""
 
 # the networks are trained with these and SLABS: other values need other weights
-_LEVEL = 0.25  # metres: a layer counts its occupied levels, not its points, of which a denser scan has more
+_LEVEL = 0.25  # metres; a layer counts occupied levels instead of points, which depend on the density of the scan
 _GROUND_CELL = 2.0  # metres
-_MAX_GROUND_HEIGHT = 0.4  # metres above the ground, below which a point belongs to the ground
-_GROUND_BAND = 0.8  # metres about the first estimate of the ground; points in it refine the estimate
+_MAX_GROUND_HEIGHT = 0.4  # metres above the ground up to which a point belongs to it
+_GROUND_BAND = 0.8  # metres about the first estimate of the ground, whose points refine it
 _MAX_SLOPE = 0.7  # metres per metre: steeper surfaces stand on the ground
-_REACH = 10  # ground cells to either side that bound a cell's height from above: half a large building
-_RELIEF_SIGMA = 8.0  # metres of the Gaussian under which the ground's mean is the zero of relief
-_MAX_RELIEF = 1.5  # metres, at which the layer saturates
+_REACH = 10  # ground cells to either side that limit a cell's height: half a large building
+_RELIEF_SIGMA = 8.0  # metres, of the Gaussian whose mean of the ground is the zero of relief
+_MAX_RELIEF = 1.5  # metres at which the layer saturates
 _BOUNDS = SLABS[0], SLABS[-1], _MAX_GROUND_HEIGHT
 
 
@@ -49,7 +49,7 @@ def birds_eye_view(points: Points, corner: Reals, shape: tuple[int, int]) -> Ima
         shape: rows and columns of the image, each a multiple of four cells (two metres).
 
     Returns:
-        (LAYERS, H, W). A height layer holds 255 times the square root of the occupied share of its 0.25 m levels. Three
+        (LAYERS, H, W). A height layer has 255 times the square root of the occupied share of its 0.25 m levels. Three
         layers follow: the greatest height, 255 at the last bound; 255 at cells with ground points; and the height of
         the ground above the mean of its surroundings, 128 for zero or unknown.
     """
@@ -78,18 +78,19 @@ def birds_eye_view(points: Points, corner: Reals, shape: tuple[int, int]) -> Ima
 def _ground(points: Points, grid: OverheadGrid, lowest: Floats32) -> tuple[Floats32, Floats32]:
     """Estimate the height of the ground (h, w) by coarse cells, and its relief, 0 for cells without ground points.
 
-    ``lowest`` (h, w) is the lowest point of each cell, inf for none.
+    ``lowest`` (h, w) is the lowest height of each cell, inf for none.
     """
     from scipy import ndimage  # takes a quarter of a second, and most users of a map draw no images
 
     occupied = np.isfinite(lowest)
-    # the ground is no steeper than _MAX_SLOPE: below a roof its height is bounded by the ground beside the building
+    # the ground is no steeper than _MAX_SLOPE: under a roof the ground beside the building limits its height
     offsets = np.arange(-_REACH, _REACH + 1) * _GROUND_CELL
     cone = -_MAX_SLOPE * np.hypot(offsets[:, None], offsets[None])
     eroded = ndimage.grey_erosion(lowest, structure=cone, mode="constant", cval=np.inf)
     ground = filled(np.where(np.isfinite(eroded), eroded, np.nan).astype(np.float32))
     ground = ndimage.median_filter(ground, 3)
-    # the lowest point of a sloping cell lies below its middle: the mean of the points near it corrects that
+    # a sloping cell's lowest point is below the height at its middle: the mean of the points near the ground corrects
+    # that
     count, total = kernels.offsets_near(points, grid, ground, _GROUND_BAND)
     ground = ndimage.gaussian_filter((ground + total / np.maximum(count, 1)).astype(np.float32), 0.5)
     level = occupied & (count > 0)
@@ -101,7 +102,7 @@ def _ground(points: Points, grid: OverheadGrid, lowest: Floats32) -> tuple[Float
 
 
 def _enlarged(values: Floats32, ratio: int) -> Floats32:
-    """Interpolate an image (h, w) bilinearly in cells ``ratio`` times as small, row by row."""
+    """Interpolate an image (h, w) bilinearly in cells smaller by ``ratio``, row by row."""
     from scipy import ndimage
 
     u, v = ((np.arange(n * ratio) + 0.5) / ratio - 0.5 for n in values.shape[::-1])

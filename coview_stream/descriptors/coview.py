@@ -17,21 +17,21 @@ Descriptor = npt.NDArray[np.float32]
 _GROUND_RADIUS = 6.0  # metres around a keyframe within which its virtual scan has ground points
 
 EYE = 1.7
-"""Metres of the sensor above the ground, where nothing tells its height."""
+"""Height of the sensor above the ground in metres, if unknown."""
 
 LOWEST_EYE = 0.3
-"""Metres of a sensor above the ground at least: points less below it stand on walls, down the slope or behind it."""
+"""Least height of a sensor above the ground, metres: higher points stand on walls, down the slope or behind it."""
 
 FLOOR_RADIUS = 15.0
-"""Metres around a body within which a lidar on it sees ground: a VLP-16 in 2 m of height from 7.5 m on."""
+"""Metres around a body within which its lidar sees ground: a VLP-16 at a height of 2 m does from 7.5 m on."""
 
-_FREE = 1.3  # metres above a body's origin on the ground: free above ground, also below trees, and part of a wall
+_FREE = 1.3  # metres above a body's origin on the ground: free above ground, even below trees, but part of a wall
 
 
 def channel(name: Channel, grid: PolarGrid) -> Descriptor:
     """Compute a descriptor channel (..., R, S) of polar bins, metres above the ground.
 
-    In ``scan_context`` heights below zero (ground in a hollow) count as zero; ``paper`` needs a grid with mean heights.
+    In ``scan_context`` negative heights (ground in a hollow) count as zero; ``paper`` needs a grid with mean heights.
     """
     if name == "scan_context":
         value: Descriptor = np.where(grid.count > 0, np.maximum(grid.max_height, 0.0), 0.0).astype(np.float32)
@@ -47,7 +47,7 @@ def describe(points: Points, centre: Floats, config: DescriptorConfig) -> dict[C
 
     Args:
         points: (N, 3) gravity-aligned points, metres, one per voxel.
-        centre: (3,) the zero of the descriptor: the keyframe's x and y, and the height of the ground below it.
+        centre: (3,) zero of the descriptor: the keyframe's x and y, and the height of the ground below it.
         config: bins and channels.
     """
     grid, _ = kernels.polar_bin(points, centre, config.rings, config.sectors, config.radius)
@@ -57,8 +57,8 @@ def describe(points: Points, centre: Floats, config: DescriptorConfig) -> dict[C
 def ground_below(points: Points, position: Floats) -> float:
     """Estimate the height of the ground below ``position`` (3,) from the points around it, metres in their frame.
 
-    The median of the lowest points below the position in 1 m cells within 6 m: robust to clutter, and independent of
-    the sensor's mounting height. A body's origin may lie on the ground itself (:func:`lies_on_ground`); otherwise,
+    It is the median of the lowest points below the position in 1 m cells within 6 m: robust to clutter, and independent
+    of the sensor's mounting height. A body's origin may lie on the ground itself (:func:`lies_on_ground`); otherwise,
     without such points, as below a hemisphere that looks up, the ground is :data:`EYE` below the position.
     """
     x, y = points[:, 0] - position[0], points[:, 1] - position[1]
@@ -78,10 +78,10 @@ def ground_below(points: Points, position: Floats) -> float:
 
 
 def lies_on_ground(points: Points, position: Floats) -> bool:
-    """Whether ``position`` (3,), the origin of a body such as a ``base_footprint``, lies on the ground that is seen.
+    """Whether ``position`` (3,), the origin of a body such as a ``base_footprint``, lies on the visible ground.
 
-    Of the 1 m cells within 15 m that have points at its height, most have free space just above: walls, of which a
-    lidar that looks up sees the feet at its own height, go on upwards.
+    Of the 1 m cells within 15 m with points at its height, most have free space just above: in contrast to walls, which
+    an upward looking lidar sees from its own height upwards.
     """
     offset = points - position.astype(np.float32)
     offset = offset[(offset[:, 0] ** 2 + offset[:, 1] ** 2 < FLOOR_RADIUS**2) & (np.abs(offset[:, 2]) < _FREE)]

@@ -1,7 +1,7 @@
-"""Feature map: the learned features of a base map, one byte a number, in square tiles where the map has points.
+"""Feature map: the learned features of a base map, one byte per number, in square tiles where the map has points.
 
-The aerial network encodes bird's-eye views of the map in windows. They overlap by more than the network's reach: the
-result does not depend on their borders.
+The aerial network encodes bird's-eye views of the map in windows. These overlap by more than the network's reach, so
+the result does not depend on their borders.
 """
 
 from __future__ import annotations
@@ -43,7 +43,7 @@ class Patch:
     """Features of a map around a place."""
 
     local: Floats32
-    """(C, h, w) of unit norm, zero where the map has nothing; cells of 1 m."""
+    """(C, h, w) of unit norm, zero without map data; cells of 1 m."""
     sigma: Floats32
     """(h, w) uncertainty of each cell as a keypoint; meaningless where ``local`` is zero."""
     corner: Floats
@@ -54,13 +54,13 @@ class FeatureMap:
     """Learned features of a base map: its arrays ``learned.*``, which may be memory-mapped.
 
     Attributes:
-        weights: :func:`weights_sha256` of the networks that made them.
+        weights: :func:`weights_sha256` of the networks that computed them.
         index: look-up of the tiles.
         place: (K, P) int8 global descriptors times 127.
         place_at: (K, 2) float32 centres of their surroundings, metres, map frame.
 
     Raises:
-        MapError: arrays are missing or do not fit together.
+        MapError: arrays are missing or inconsistent.
     """
 
     def __init__(self, arrays: dict[str, npt.NDArray[Any]], parameters: dict[str, Any]) -> None:
@@ -81,7 +81,7 @@ class FeatureMap:
 
     @property
     def dimensions(self) -> int:
-        """Numbers C in a local descriptor."""
+        """Number of components C of a local descriptor."""
         return int(self._local.shape[3])
 
     @property
@@ -106,11 +106,11 @@ class FeatureMap:
 
     @property
     def tile_centres(self) -> Floats:
-        """(T, 2) middles of the tiles, metres, map frame."""
+        """(T, 2) centres of the tiles, metres, map frame."""
         return np.asarray((self.index.tiles + 0.5) * (TILE * LOCAL_CELL), dtype=np.float64)
 
     def patch(self, centre: Reals, reach: float) -> Patch:
-        """Return the features within ``reach`` metres of ``centre`` (x and y, map frame), out to whole cells."""
+        """Return the features within ``reach`` metres of ``centre`` (x and y, map frame), rounded to whole cells."""
         middle = np.asarray(centre, dtype=np.float64)[:2]
         low = np.floor((middle - reach) / LOCAL_CELL).astype(np.int64)
         high = np.ceil((middle + reach) / LOCAL_CELL).astype(np.int64)
@@ -123,7 +123,7 @@ class FeatureMap:
         return Patch(vectors, dequantized_sigma(sigma), np.asarray(low * LOCAL_CELL, dtype=np.float64))
 
     def sample(self, tiles: int) -> Floats32:
-        """Return the features (C, N) of the cells of at most so many tiles, evenly spread."""
+        """Return the features (C, N) of the cells of at most ``tiles`` tiles, evenly spread."""
         chosen = self._local[:: -(-len(self._local) // tiles) or 1]
         cells = np.asarray(chosen).reshape(-1, self.dimensions)
         return np.ascontiguousarray(dequantized(cells[cells.any(axis=1)]).T)
@@ -147,7 +147,7 @@ class FeatureMap:
         """Check that the installed networks can be compared with these features.
 
         Raises:
-            MapError: other weights, or images of another version, have made them.
+            MapError: the features were computed by other weights, or from images of another version.
             InputError: there are no weights.
         """
         for view in VIEW_NAMES:
@@ -188,7 +188,7 @@ def dequantized(vectors: Int8s) -> Floats32:
 
 
 def quantized_sigma(sigma: Floats32) -> npt.NDArray[np.uint8]:
-    """Store positive sigmas (any shape) as bytes on a logarithmic scale, with 1.5 % of error from 0.02 to 50."""
+    """Store positive sigmas (any shape) as bytes on a logarithmic scale, with 1.5 % error from 0.02 to 50."""
     steps = np.log(np.clip(sigma, _MIN_SIGMA, _MAX_SIGMA) / _MIN_SIGMA) * _STEPS
     return np.asarray(np.rint(steps), dtype=np.uint8)
 
@@ -199,7 +199,7 @@ def dequantized_sigma(sigma: npt.NDArray[np.uint8]) -> Floats32:
 
 
 class TileIndex:
-    """Look-up of tiles by position; made from (T, 2) tile numbers, column (x) and row (y)."""
+    """Look-up of tiles by position, built from tile numbers (T, 2), column (x) and row (y)."""
 
     def __init__(self, tiles: npt.NDArray[np.int32]) -> None:
         self.tiles = np.array(tiles, dtype=np.int64).reshape(-1, 2)
@@ -225,7 +225,7 @@ class TileIndex:
 
 
 def _overlap(begin: int, length: int, size: int) -> tuple[slice, slice]:
-    """Return slices of an axis of ``size`` cells, and of a part of ``length`` cells from ``begin``: their overlap."""
+    """Return the overlap of an axis of ``size`` cells and ``length`` cells from ``begin``, as slices of both."""
     low, high = max(0, begin), max(0, min(size, begin + length))
     return slice(low, max(low, high)), slice(low - begin, max(low, high) - begin)
 
@@ -233,11 +233,11 @@ def _overlap(begin: int, length: int, size: int) -> tuple[slice, slice]:
 WINDOW = 256
 """Metres along the edge of a window, which is drawn and encoded at once; a multiple of a tile's edge."""
 
-_DRAW_MARGIN = 48  # metres around a window: points in it determine the window's ground
-_NET_MARGIN = 64  # metres around a window, the network's reach: 30 m for its layers, 28 for GeM's disk
+_DRAW_MARGIN = 48  # metres around a window whose points determine its ground
+_NET_MARGIN = 64  # metres around a window, the network's reach: 30 for its layers, 28 for GeM's disk
 _KNOWN_RADIUS = 4  # metres around a point within which the map has features, to bridge shadows
 _CELLS = round(1 / CELL)  # image cells a metre
-_PER_PLACE = 2  # of the network's place cells along the edge of a stored one
+_PER_PLACE = 2  # network's place cells along the edge of a stored one
 
 Windows = dict[tuple[int, int], Image]
 
@@ -286,7 +286,7 @@ def features_of_square(points: Points, corner: Ints, size: int) -> dict[str, npt
     whole = birds_eye_view(points, (corner - _NET_MARGIN - _DRAW_MARGIN).astype(np.float32), (edge, edge))
     rim = _DRAW_MARGIN * _CELLS
     around = whole[:, rim:-rim, rim:-rim].copy()
-    # one thread: processes do several squares at once
+    # one thread, as processes encode several squares at once
     return _stored(network("aerial", 1)(around), around, corner, (size, size))
 
 
@@ -351,13 +351,13 @@ def _stored(features: Features, image: Image, corner: Ints, shape: tuple[int, in
 
 
 def _known(image: Image) -> Bools:
-    """Mask the 1 m cells (H, W) of an image within ``_KNOWN_RADIUS`` of a point."""
+    """Return a mask of the 1 m cells (H, W) of an image within ``_KNOWN_RADIUS`` of a point."""
     filled = image[:-1].any(axis=0)
     rows, columns = (n // _CELLS for n in filled.shape)
     coarse = filled.reshape(rows, _CELLS, columns, _CELLS).any(axis=(1, 3))
     if not coarse.any():
         return np.asarray(coarse)
-    from scipy import ndimage  # a map is opened without it
+    from scipy import ndimage  # not needed to open a map
 
     return np.asarray(ndimage.distance_transform_edt(~coarse) <= _KNOWN_RADIUS)
 
@@ -370,7 +370,7 @@ def _in_tiles(values: npt.NDArray[Any]) -> npt.NDArray[Any]:
 
 
 def _places(place: Floats32, mapped: Bools, shape: tuple[int, int]) -> tuple[Int8s, Floats]:
-    """Pool global descriptors (K, P) over squares of 8 m, as a query pools its middle cells; also their middles."""
+    """Pool global descriptors (K, P) over squares of 8 m, as a query pools its middle cells; return their centres."""
     edge, side = round(_NET_MARGIN / PLACE_CELL), round(PLACE_CELL * _PER_PLACE)
     height, width = (n // side for n in shape)
     inner = place[:, edge : edge + _PER_PLACE * height, edge : edge + _PER_PLACE * width]

@@ -1,8 +1,8 @@
-"""Trained encoders of bird's-eye views: their weights' files, and their forward pass in NumPy.
+"""Trained encoders of bird's-eye views: their weight files, and their forward pass in NumPy.
 
-Images in here have their channels last, (H, W, C), so that a convolution is one product of matrices per strip of rows:
-the 3 x 3 cells around each cell, copied side by side, times the weights. An image that a convolution reads has a border
-of one cell of zeros.
+Images have their channels last here, (H, W, C), so that a convolution is one matrix product per strip of rows: the
+3 x 3 cells around each cell, copied side by side, times the weights. The input image of a convolution has a border of
+one cell of zeros.
 """
 
 from __future__ import annotations
@@ -40,7 +40,7 @@ PLACE_CELL = 4.0
 """Edge of a cell of global descriptors, metres."""
 
 PLACE_REACH = 7
-"""Cells of 4 m about the middle that a global descriptor pools, under a Gaussian window of 14 m: up to 28 m."""
+"""Radius in cells of 4 m, thus 28 m, over which a global descriptor pools under a Gaussian window of 14 m."""
 
 PLACE_SIGMA = 3.5
 """Standard deviation of that window, cells of 4 m."""
@@ -49,10 +49,10 @@ MIN_SIGMA = 0.05
 """Least uncertainty of a cell."""
 
 MIN_ACTIVATION = 1e-4
-"""Least activation that the generalised mean (GeM) raises to its power."""
+"""Lower limit of activations that the generalised mean (GeM) raises to its power."""
 
 _MULTIPLE = 8  # image cells
-_STRIP = 1 << 18  # numbers of a strip's copied cells, 1 MB: they stay in the cache of a core
+_STRIP = 1 << 18  # numbers in a strip's copied cells, 1 MB, which stays in the cache of a core
 _TINY = np.float32(1e-12)
 _REMEDY = "install the package again, or name your own weights' folder in COVIEW_WEIGHTS"
 
@@ -61,7 +61,7 @@ _Run = Callable[[Callable[[int], None], Iterable[int]], Iterable[None]]
 
 @dataclass(frozen=True)
 class Features:
-    """A network's outputs for an image (LAYERS, H, W); all three begin at its corner."""
+    """A network's outputs for an image (LAYERS, H, W); all three start at its corner."""
 
     local: Floats32
     """(C, H / 2, W / 2) of unit norm, independent of heading; cells of 1 m, row along y."""
@@ -77,10 +77,10 @@ class Network:
     Args:
         view: the view.
         directory: of the weights; None takes :func:`weights_directory`.
-        threads: that share the strips of a convolution; results do not depend on their number.
+        threads: number that shares the strips of a convolution; it does not affect results.
 
     Raises:
-        InputError: there are no weights in the directory, or they are of another version or another file.
+        InputError: the directory has no weights, or those of another version or another file.
     """
 
     def __init__(self, view: ViewName, directory: Path | None = None, threads: int = 1) -> None:
@@ -141,15 +141,15 @@ LAYER_NAMES = (
     "down4", "at4.0.first", "at4.0.second", "at4.1.first", "at4.1.second",
     "lateral.0", "lateral.1", "lateral.2", "local", "sigma", "place",
 )  # fmt: skip
-"""Convolutions, whose weights (rows, columns, inputs, outputs) and biases (outputs) a file holds, with ``power``.
+"""Convolutions, whose weights (rows, columns, inputs, outputs) and biases (outputs) a file contains, with ``power``.
 
-Normalisations are part of them. The stem takes bytes, and its inputs are the layers of four cells of 0.5 m, row by row.
+They include normalisations. The stem takes bytes; its inputs are the layers of four cells of 0.5 m, row by row.
 """
 
 
 @dataclass(frozen=True)
 class _Layer:
-    """A convolution of 1 or 3 x 3 cells; ValueError unless its arrays are of one."""
+    """A convolution of 1 or 3 x 3 cells; ValueError for inconsistent arrays."""
 
     weight: Floats32
     bias: Floats32
@@ -159,7 +159,7 @@ class _Layer:
             raise ValueError(f"weights {self.weight.shape} and biases {self.bias.shape} are of no convolution")
 
     def project(self, x: Floats32) -> Floats32:
-        """Multiply the channels of each cell of an image (H, W, C) with the weights of a single cell."""
+        """Multiply the channels of each cell of an image (H, W, C) by the weights of a single cell."""
         y: Floats32 = x @ self.weight[0, 0]
         y += self.bias
         return y
@@ -167,7 +167,7 @@ class _Layer:
     def convolve(
         self, x: Floats32, run: _Run, *, stride: int = 1, add: Floats32 | None = None, rectify: bool = True
     ) -> Floats32:
-        """Convolve with 3 x 3 cells, add ``add`` (bordered) and rectify; bordered images in and out."""
+        """Convolve with 3 x 3 cells, add ``add`` (bordered) and rectify; input and output have a border."""
         channels, outputs = self.weight.shape[2:]
         if x.shape[2] != channels:
             raise ValueError(f"an image of {x.shape[2]} channels, weights of {channels}")
@@ -203,7 +203,7 @@ def _inner(x: Floats32) -> Floats32:
 
 
 def _unshuffled(image: Image) -> Floats32:
-    """Gather the layers of 2 x 2 cells of an image (LAYERS, H, W) in one cell, and give it a border."""
+    """Stack the layers of 2 x 2 cells of an image (LAYERS, H, W) in one cell, and add a border."""
     layers, height, width = (image.shape[0], image.shape[1] // 2, image.shape[2] // 2)
     rows = np.ascontiguousarray(image.transpose(1, 2, 0)).reshape(height, 2, width, 2 * layers)
     x = np.zeros((height + 2, width + 2, 4 * layers), dtype=np.float32)
@@ -212,7 +212,7 @@ def _unshuffled(image: Image) -> Floats32:
 
 
 def _doubled(x: Floats32) -> Floats32:
-    """Interpolate an image (H, W, C) linearly at half its cells' edge, (2 H, 2 W, C)."""
+    """Interpolate an image (H, W, C) linearly to (2 H, 2 W, C)."""
     for axis in (0, 1):
         rows = x.swapaxes(0, axis)
         part = np.float32(0.25) * np.concatenate([rows[:1], rows, rows[-1:]])
@@ -232,7 +232,7 @@ def _pooled(x: Floats32, power: np.float32) -> Floats32:
 
 
 def _window(size: int) -> Floats32:
-    """Return the matrix (size, size) that averages a row of cells under the Gaussian window; beyond them is zero."""
+    """Return the matrix (size, size) that averages a row of cells under the Gaussian window, with zeros beyond them."""
     away = np.abs(np.arange(size)[:, None] - np.arange(size))
     weight = np.exp(-0.5 * (np.arange(-PLACE_REACH, PLACE_REACH + 1) / PLACE_SIGMA) ** 2)
     inside = away <= PLACE_REACH
@@ -281,9 +281,9 @@ def weights_name(view: str) -> str:
 
 
 def weights_id(path: Path) -> str:
-    """Return the sha256 of a file of weights, or of the file that it is another form of, as the card says.
+    """Return the sha256 of a weight file, or of its original if the card says that it is another form of that.
 
-    Maps name it: features of weights in another form are the same.
+    Maps store it, so that features of weights in another form count as the same.
     """
     name = file_sha256(path)
     same = _card(path).get("same_as", {})
@@ -296,7 +296,7 @@ def file_sha256(path: Path) -> str:
 
 
 def _check_hash(path: Path) -> None:
-    """Refuse weights whose hash differs from the card's, if there is one."""
+    """Refuse weights whose hash differs from the card's, if any."""
     hashes = _card(path).get("sha256", {})
     expected = hashes.get(path.name) if isinstance(hashes, dict) else None
     if expected is not None and file_sha256(path) != expected:

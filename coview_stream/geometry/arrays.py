@@ -1,4 +1,4 @@
-"""Names of array types by the kind of their numbers; shapes and units are in the docstrings that use them."""
+"""Names of array types by number type; docstrings give shapes and units."""
 
 from __future__ import annotations
 

@@ -1,6 +1,6 @@
-"""Tails and quantiles of the distributions that the evidence and the protection level need.
+"""Tails and quantiles of the distributions of the evidence and the protection level.
 
-SciPy has them too, for 18 MB and a fifth of a second in each process of a node.
+SciPy has them too, but costs 18 MB and a fifth of a second in each process of a node.
 """
 
 from __future__ import annotations
@@ -12,7 +12,7 @@ from statistics import NormalDist
 _STEPS = 100  # at most; ten suffice
 
 normal_quantile = NormalDist().inv_cdf
-"""Return the value that a standard normal variable stays below with a probability in (0, 1)."""
+"""Return the quantile of a standard normal variable for a probability in (0, 1)."""
 
 
 def chi2_tail(freedom: int, value: float) -> float:
@@ -27,7 +27,7 @@ def chi2_tail(freedom: int, value: float) -> float:
 
 @lru_cache
 def chi2_quantile(freedom: int, tail: float) -> float:
-    """Return the value that a chi-square variable exceeds with a probability in (0, 1)."""
+    """Return the value that a chi-square variable exceeds with probability ``tail`` in (0, 1)."""
     low, high = 0.0, 1.0
     while chi2_tail(freedom, high) > tail:
         low, high = high, 2.0 * high
@@ -65,10 +65,10 @@ def beta_share(a: float, b: float, x: float) -> float:
 
 
 def f_quantile(axes: float, freedom: float, tail: float) -> float:
-    """Return the value that an F(axes, freedom) variable exceeds with a probability in (0, 1)."""
+    """Return the value that an F(axes, freedom) variable exceeds with probability ``tail`` in (0, 1)."""
     a, b = 0.5 * freedom, 0.5 * axes
     log_x = min((math.log(tail * a) + log_beta(a, b)) / a, -1e-9)  # exact for rare values
-    for _ in range(_STEPS):  # Newton's, on logarithms: nearly straight
+    for _ in range(_STEPS):  # Newton's method on logarithms, where the function is nearly linear
         x = math.exp(log_x)
         share = beta_share(a, b, x)
         density = math.exp(a * log_x + (b - 1.0) * math.log1p(-x) - log_beta(a, b))

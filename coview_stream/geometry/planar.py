@@ -1,4 +1,4 @@
-"""Planar motions (..., 3): x and y in metres along the level axes of the earlier pose, and the turn in radians.
+"""Planar motions (..., 3): x and y in metres along the level axes of the earlier pose, and the rotation in radians.
 
 A planar pose is the motion from the origin.
 """
@@ -22,7 +22,7 @@ def planar_pose(T: Pose) -> Floats:
 
 
 def planar_covariance(covariance: Floats, T: Pose) -> Floats:
-    """Return a covariance (6, 6) over (rx, ry, rz, x, y, z), map axes, as one (3, 3) of motions from a pose."""
+    """Return a covariance (6, 6) over (rx, ry, rz, x, y, z), map axes, as that (3, 3) of motions from a pose."""
     R = rot_z(-yaw_of(T))
     return np.asarray(R @ covariance[np.ix_([3, 4, 2], [3, 4, 2])] @ R.T)
 
@@ -39,22 +39,22 @@ def compose(a: Floats, b: Floats) -> Floats:
 
 
 def inverted(a: Floats) -> Floats:
-    """Return the motions (..., 3) back."""
+    """Return the inverse motions (..., 3)."""
     x, y = _turned(-a[..., 2], a)
     return np.stack([-x, -y, -a[..., 2]], axis=-1)
 
 
 def between(before: Floats, now: Floats) -> Floats:
-    """Return the motions (..., 3) from poses (..., 3) to others (..., 3); turns in [-pi, pi)."""
+    """Return the motions (..., 3) from poses ``before`` to poses ``now`` (..., 3); turns in [-pi, pi)."""
     gap = now - before
     x, y = _turned(-before[..., 2], gap)
     return np.stack([x, y, _wrapped(gap[..., 2])], axis=-1)
 
 
 def smoothly_between(at: Floats, stamps: Floats, poses: Floats) -> Floats:
-    """Return poses (L, 3) at moments (L,) by cubics between those (N, 3) at their stamps, with speeds by differences.
+    """Interpolate poses (N, 3) at stamps (N,) to moments (L,) by cubics, with speeds from differences: (L, 3).
 
-    The headings are those of a path, not wrapped.
+    Headings must not be wrapped.
     """
     after = np.clip(np.searchsorted(stamps, at, side="right"), 1, len(stamps) - 1)
     span = (stamps[after] - stamps[after - 1])[:, None]

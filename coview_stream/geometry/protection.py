@@ -1,10 +1,10 @@
-"""Protection level of a pose: the error in metres and in degrees that is exceeded at most once in a thousand.
+"""Protection level of a pose: the error in metres and in degrees that is exceeded at most once in a thousand poses.
 
-A covariance says how large errors usually are. Rare ones are larger than its Gaussian would have them: its scale, too,
-is an estimate, right on the average of many places and too small in some. With an unknown scale a Gaussian becomes a
-Student-t. So the error's square relative to the trace of its covariance is taken as F(h, n) distributed, times a factor
-squared: h counts the axes that the error comes from (3 for a sphere, 1 for a needle; Satterthwaite's (tr C)^2 / tr C^2)
-and n, the tail's degrees of freedom, says how well the scale is known.
+A covariance gives the usual size of errors. Rare errors exceed its Gaussian: its scale is an estimate, too, right on
+average over many places and too small at some. With an unknown scale a Gaussian becomes a Student-t. So the squared
+error relative to the trace of its covariance is taken as F(h, n) distributed, times a squared factor: h is the
+effective number of axes of the error (3 for a sphere, 1 for a needle; Satterthwaite's (tr C)^2 / tr C^2), and n, the
+degrees of freedom of the tail, tells how well the scale is known.
 """
 
 from __future__ import annotations
@@ -18,17 +18,17 @@ from coview_stream.geometry.arrays import Floats
 from coview_stream.geometry.distributions import f_quantile
 
 RISK = 1e-3
-"""Probability with which an error may exceed its level; in space, in the plane, in height and in angle each."""
+"""Probability that an error exceeds its level: in space, in the plane, in height and in angle each."""
 
 ALERT_METRES, ALERT_DEGREES = 1.0, 3.0
-"""Alert limit: a pose that is given may not be off by more; set by hand."""
+"""Alert limit: largest allowed error of a given pose; set by hand."""
 
 TAILS = {"metres": (1.03, 3.9), "degrees": (0.6, 2.7), "horizontal": (1.03, 3.9), "vertical": (1.03, 3.9)}
-"""Factor on the sigma, and degrees of freedom, set by hand, above what ``python -m bench protection`` prints.
+"""Factor on the sigma, and degrees of freedom, set by hand, above the values of ``python -m bench protection``.
 
 Split-conformal factors on campuses and sparse forests are 0.27 to 0.29, at a risk of 0.012, for which 82 blocks
-suffice; on a town 0.22 to 0.35. On maps of which much has changed errors were four times a level once in 2,321 blocks,
-and it takes 999 blocks to calibrate a risk of 1e-3: until then the factors stay as wide as they are.
+suffice; on a town 0.22 to 0.35. On strongly changed maps one of 2,321 blocks had errors of four times the level, and a
+risk of 1e-3 takes 999 blocks to calibrate: until then the factors stay this wide.
 """
 
 
@@ -37,13 +37,13 @@ LEVELS = ("m", "deg", "horizontal_m", "vertical_m")
 
 
 class OtherHeights(NamedTuple):
-    """Heights beside the registered one at which the robot may stand, where the ground may have been changed.
+    """Other heights than the registered one at which the robot may be, where the ground may have been changed.
 
-    They are known by their probabilities, so no tail is added: the level is widened by their ``reach``.
+    They have known probabilities, so no tail is added: the level is widened by their ``reach``.
     """
 
     variance: float = 0.0  # metres^2, part of the covariance
-    reach: float = 0.0  # metres that a height is off with a probability of half of RISK at most
+    reach: float = 0.0  # error of the height in metres, exceeded with probability RISK / 2 at most
 
 
 NO_OTHER = OtherHeights()
@@ -51,15 +51,15 @@ NO_OTHER = OtherHeights()
 
 @dataclass(frozen=True)
 class ProtectionLevel:
-    """Error that a pose exceeds with a probability of at most 1e-3, relative to the map.
+    """Error relative to the map that a pose exceeds with probability 1e-3 at most.
 
     Attributes:
         metres: distance of the position, in space.
         degrees: angle of the rotation.
         horizontal: metres in the map's x, y plane.
         vertical: metres along its z.
-        doubt: times as wide as the covariance alone has them.
-        others: heights that are possible, too.
+        doubt: factor on the levels by the covariance.
+        others: other possible heights.
     """
 
     metres: float
@@ -82,9 +82,9 @@ def protection_level(
 
     Args:
         covariance: (6, 6) over (x, y, z, roll, pitch, yaw), m2 and rad2.
-        doubt: 1 or more: times as large as usual the errors may be.
-        risk: probability with which an error may exceed the level.
-        others: heights that are possible beside the pose's; their variance is part of the covariance.
+        doubt: factor, 1 or more, by which errors may exceed their usual size.
+        risk: probability that an error exceeds the level.
+        others: other possible heights; their variance is part of the covariance.
     """
     known = np.array(covariance)
     known[2, 2] = max(known[2, 2] - others.variance, 0.0)
@@ -98,19 +98,19 @@ def protection_level(
 
 
 def axes_of(covariance: Floats) -> tuple[float, float]:
-    """Return the trace of a covariance (K, K), and the number of axes, 1 to K, that its errors come from."""
+    """Return the trace of a covariance (K, K), and the effective number of axes of its errors, 1 to K."""
     trace, squares = float(np.trace(covariance)), float(np.sum(covariance * covariance))
     return trace, trace**2 / squares if squares > 0 else float(len(covariance))
 
 
 def _quantile(covariance: Floats, factor: float, freedom: float, risk: float) -> float:
-    """Norm that an error with a covariance (K, K) exceeds with the probability ``risk``."""
+    """Norm that an error with a covariance (K, K) exceeds with probability ``risk``."""
     trace, axes = axes_of(covariance)
     return factor * float(np.sqrt(trace * f_quantile(axes, freedom, risk)))
 
 
 LEAST = 1e-9
-"""Least probability that is reported: the model of the evidence is no better."""
+"""Least reported probability: the model of the evidence is no better."""
 
 
 def one_in(probability: float) -> str:

@@ -1,7 +1,7 @@
 """Rasters: points by cell, window minima and maxima, and filled gaps.
 
-SciPy has such filters too; importing it takes a quarter of a second, which a node that starts does not have. So only
-:func:`filled`, which builds maps, imports it, and does so when called.
+SciPy has such filters too, but its import takes a quarter of a second of a node's start. So only :func:`filled`, which
+builds maps, imports it, when called.
 """
 
 from __future__ import annotations
@@ -12,18 +12,18 @@ from coview_stream.errors import ConfigError
 from coview_stream.geometry.arrays import Floats, Floats32, Indices, Ints, Reals
 from coview_stream.geometry.transforms import Points
 
-_MAX_CELLS = 200_000_000  # set by hand: a raster above that (0.8 GB) means stray coordinates, not a map
+_MAX_CELLS = 200_000_000  # set by hand: a larger raster (0.8 GB) means stray coordinates, not a map
 
 
 def min_filter(raster: Floats32, size: int) -> Floats32:
-    """Find the smallest value around each cell of (H, W), in a square of ``size`` cells, an odd number."""
+    """Return the minimum around each cell of (H, W), in a square of ``size`` cells, an odd number."""
     return -max_filter(-raster, size)
 
 
 def max_filter(raster: Floats32, size: int) -> Floats32:
-    """Find the greatest value around each cell of (H, W), in a square of ``size`` cells, an odd number.
+    """Return the maximum around each cell of (H, W), in a square of ``size`` cells, an odd number.
 
-    It filters along one axis after the other: the maximum of a square is the maximum of its rows' maxima.
+    It filters one axis after the other: the maximum of a square is the maximum of its rows' maxima.
     """
     if size < 1 or size % 2 == 0:
         raise ValueError(f"size must be odd, so that a window has a middle, got {size}")
@@ -47,7 +47,7 @@ def cells(points: Points, cell: float) -> tuple[Floats, tuple[int, int], Ints]:
         The lower corner (2,) in metres, the shape (rows, columns), and the flat cell index (N,) of each point.
 
     Raises:
-        ConfigError: the raster would be absurdly large for a map.
+        ConfigError: the raster is too large for a map.
     """
     corner = np.floor(points[:, :2].min(axis=0).astype(np.float64) / cell) * cell
     index = [np.floor((points[:, axis] - corner[axis]) / cell).astype(np.int64) for axis in (0, 1)]
@@ -60,12 +60,12 @@ def cells(points: Points, cell: float) -> tuple[Floats, tuple[int, int], Ints]:
 
 
 def by_square(points: Reals, edge: float) -> tuple[Ints, Ints, Ints]:
-    """Sort points (N, 2 or more) into squares of an edge, by column and row.
+    """Sort points (N, 2 or more) into squares with edge ``edge``, by column and row.
 
     Returns:
         order: (N,) indices of the points, square by square.
         squares: (T, 2) column and row: a square covers ``[column, column + 1) * edge`` in x, likewise in y.
-        begin: (T + 1,) where each square's points begin in that order, and their number.
+        begin: (T + 1,) start of each square's points in that order, and their number.
     """
     cells = np.floor(points[:, :2].astype(np.float64) / edge).astype(np.int64)
     order = np.lexsort((cells[:, 1], cells[:, 0]))
@@ -75,7 +75,7 @@ def by_square(points: Reals, edge: float) -> tuple[Ints, Ints, Ints]:
 
 
 def lowest_per_cell(points: Points, flat: Ints) -> Indices:
-    """Find the index of the lowest point of each occupied cell, in the order of the cells."""
+    """Return the index of the lowest point of each occupied cell, in the order of the cells."""
     order = np.lexsort((points[:, 2], flat))
     ordered = flat[order]
     return np.asarray(order[np.append(True, ordered[1:] != ordered[:-1])])
@@ -102,14 +102,14 @@ def filled(z: Floats32) -> Floats32:
     return np.where(unknown, smooth, z).astype(np.float32)
 
 
-_SAMPLE = 100_000  # distances that a median is taken of
+_SAMPLE = 100_000  # values sampled for a bound
 
 
 def argsmallest(values: Floats32, count: int) -> Ints:
-    """Return the indices of the ``count`` smallest of (N,) values, smallest first; equal ones by index."""
+    """Return the indices of the ``count`` smallest values of (N,), smallest first; equal ones by index."""
     if count >= len(values):
         return np.asarray(np.argsort(values, kind="stable"))
-    # a bound from a sample rules most out; where it leaves fewer than ``count``, all are sorted
+    # a bound from a sample rules out most; if it leaves fewer than ``count``, all are sorted
     every = max(1, len(values) // _SAMPLE)
     sample = values[::every]
     rank = min(2 * count // every, len(sample) - 1)

@@ -2,14 +2,14 @@
 
 ``T_target_source`` maps coordinates of the *source* frame into the *target* frame: ``p_target = T_target_source @
 p_source``. Metres and radians throughout; quaternions are x, y, z, w. Rotations come single or in stacks; SciPy has
-them too, but importing it takes half a second, of the two in which a node should start.
+them too, but its import takes half a second of a node's start, which should take two.
 
-A small motion of a pose has six numbers (rx, ry, rz, x, y, z) *along the map's axes*: the body turns about its own
-origin, then it is shifted, ``R -> exp(r) R`` and ``t -> t + s``. A pose graph's tangent is the *body's*, on the
-right, ``T -> T exp(xi)`` with xi = (rotation, translation) along the body's axes. To
-first order, which is all that a covariance says, both name the same motions: r = R xi_r and s = R xi_t. So a
-covariance goes from one to the other by the rotation alone, diag(R, R) C diag(R, R)^T. (The whole adjoint, with its
-lever arm [t]x R, would belong to turning about the map's origin.)
+A small motion of a pose has six numbers (rx, ry, rz, x, y, z) *along the map's axes*: the body rotates about its own
+origin, then is shifted, ``R -> exp(r) R`` and ``t -> t + s``. A pose graph's tangent is the *body's*, on the right, ``T
+-> T exp(xi)`` with xi = (rotation, translation) along the body's axes. To first order, which is all that a covariance
+describes, both are the same motions: r = R xi_r and s = R xi_t. So a covariance is converted by the rotation alone,
+diag(R, R) C diag(R, R)^T. (The whole adjoint, with its lever arm [t]x R, would belong to rotations about the map's
+origin.)
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ Poses = npt.NDArray[np.float64]
 Points = npt.NDArray[np.float32]
 """(N, 3) float32 coordinates near the origin of their frame, metres."""
 
-_SMALL = 1e-8  # radians: below, the sine is the angle
+_SMALL = 1e-8  # radians, below which the sine equals the angle
 
 
 def nearest_rotation(R: Reals) -> Floats:
@@ -51,7 +51,7 @@ def skew(v: Floats) -> Floats:
 
 
 def exp_so3(rotvec: npt.ArrayLike) -> Floats:
-    """Return the rotations (..., 3, 3) about axes (..., 3) by their length, radians (Rodrigues' formula)."""
+    """Return the rotations (..., 3, 3) of rotation vectors (..., 3), radians (Rodrigues' formula)."""
     v = np.asarray(rotvec, dtype=np.float64)
     angle = np.sqrt((v * v).sum(axis=-1))[..., None, None]
     small = angle < _SMALL
@@ -65,7 +65,7 @@ def exp_so3(rotvec: npt.ArrayLike) -> Floats:
 def log_so3(R: Reals) -> Floats:
     """Return rotation vectors (..., 3), axis times angle in [0, pi], of rotation matrices (..., 3, 3)."""
     M = np.asarray(R, dtype=np.float64)
-    axis = 0.5 * (M[..., [2, 0, 1], [1, 2, 0]] - M[..., [1, 2, 0], [2, 0, 1]])  # times the sine
+    axis = 0.5 * (M[..., [2, 0, 1], [1, 2, 0]] - M[..., [1, 2, 0], [2, 0, 1]])  # times the sine of the angle
     sine, cosine = np.sqrt((axis * axis).sum(axis=-1)), 0.5 * (np.trace(M, axis1=-2, axis2=-1) - 1.0)
     if (cosine > -0.9).all():  # near half a turn the sine loses the axis
         small = sine < _SMALL
@@ -78,7 +78,7 @@ def log_so3(R: Reals) -> Floats:
 
 
 def quat_to_matrix(quaternions: npt.ArrayLike) -> Floats:
-    """Return rotation matrices (..., 3, 3) of quaternions (..., 4) of any length but zero."""
+    """Return rotation matrices (..., 3, 3) of quaternions (..., 4) of any nonzero length."""
     q = np.asarray(quaternions, dtype=np.float64)
     x, y, z, w = np.moveaxis(q / np.linalg.norm(q, axis=-1, keepdims=True), -1, 0)
     R = np.empty((*q.shape[:-1], 3, 3))
@@ -97,7 +97,7 @@ def matrix_to_quat(R: Reals) -> Floats:
     xx, yy, zz = M[..., 0, 0], M[..., 1, 1], M[..., 2, 2]
     x, y, z = M[..., 2, 1] - M[..., 1, 2], M[..., 0, 2] - M[..., 2, 0], M[..., 1, 0] - M[..., 0, 1]
     xy, xz, yz = M[..., 0, 1] + M[..., 1, 0], M[..., 0, 2] + M[..., 2, 0], M[..., 1, 2] + M[..., 2, 1]
-    # row k is 4 q_k q: each is right, the one of the largest component is right to the last digit
+    # row k is 4 q_k q: all are right, but that of the largest component is the most exact
     rows = np.stack(
         [
             np.stack([1 + xx - yy - zz, xy, xz, x], axis=-1),
@@ -113,7 +113,7 @@ def matrix_to_quat(R: Reals) -> Floats:
 
 
 def slerp(start: Reals, end: Reals, share: npt.ArrayLike) -> Floats:
-    """Return rotations (..., 3, 3), the ``share`` (...) of the way from ``start`` to ``end``, the short way round."""
+    """Return rotations (..., 3, 3) at a ``share`` (...) of the path from ``start`` to ``end``, the short way round."""
     rotvec = log_so3(np.swapaxes(start, -1, -2) @ end)
     return np.asarray(start @ exp_so3(np.asarray(share, dtype=np.float64)[..., None] * rotvec))
 
@@ -141,8 +141,8 @@ def transform(T: Pose, points: npt.NDArray[_Real]) -> npt.NDArray[_Real]:
 
 
 def norms(points: npt.NDArray[_Real], origin: npt.NDArray[_Real] | None = None) -> npt.NDArray[_Real]:
-    """Return the distances (N,) of points (N, 3) from ``origin`` (3,), by default zero, in the points' precision."""
-    # by columns: np.linalg.norm along the short axis takes ten times as long, for the same numbers
+    """Return the distances (N,) of points (N, 3) from ``origin`` (3,), default zero, in the points' precision."""
+    # by columns: np.linalg.norm along the short axis takes ten times as long for the same numbers
     x, y, z = (points[:, d].copy() if origin is None else points[:, d] - origin[d] for d in range(3))
     x *= x
     y *= y
@@ -170,7 +170,7 @@ def wrap_angle(angle: float) -> float:
 
 def rotation_angle(T: Pose) -> float:
     """Return the angle of the rotation part, radians in [0, pi]."""
-    # the sine keeps its precision near zero, where the cosine of eq. 15 has none left
+    # the sine stays precise near zero, where the cosine of eq. 15 has lost all precision
     (a, b, c), (d, e, f), (g, h, i) = T[:3, :3].tolist()
     sine = 0.5 * math.hypot(h - f, c - g, d - b)
     return math.atan2(sine, 0.5 * (a + e + i - 1.0))
@@ -187,7 +187,7 @@ def orthonormal(T: Pose) -> Pose:
 
 
 def is_pose(T: Reals) -> bool:
-    """Tell whether ``T`` is a finite 4x4 rigid transform: a rotation, orthonormal to 1e-3, and a last row 0 0 0 1."""
+    """Return whether ``T`` is a finite rigid transform (4, 4): rotation orthonormal to 1e-3, last row 0 0 0 1."""
     if T.shape != (4, 4) or not np.isfinite(T).all():
         return False
     R = T[:3, :3]
@@ -196,7 +196,7 @@ def is_pose(T: Reals) -> bool:
 
 
 def why_no_pose(T: Reals) -> str:
-    """Return the fault of a matrix that is no pose (:func:`is_pose`), and the remedy, as a clause."""
+    """Return a clause on why a matrix is no pose (:func:`is_pose`), with the remedy."""
     if T.shape != (4, 4):
         flaw = f"it has shape {T.shape}; give a 4x4 matrix"
     elif not np.isfinite(T).all():
@@ -213,9 +213,9 @@ def why_no_pose(T: Reals) -> str:
 
 
 def interpolate(T_start: Poses, T_end: Poses, share: npt.ArrayLike) -> Poses:
-    """Return poses (..., 4, 4), the ``share`` (...) of the way from ``T_start`` to ``T_end`` (..., 4, 4).
+    """Return poses (..., 4, 4) at a ``share`` (...) of the path from ``T_start`` to ``T_end`` (..., 4, 4).
 
-    The rotation turns at a constant rate the short way round, the position moves along a straight line. Shares outside
+    The rotation has a constant rate, the short way round, and the position moves along a straight line. Shares outside
     [0, 1] extrapolate.
     """
     part = np.asarray(share, dtype=np.float64)
@@ -237,7 +237,7 @@ def pose_from_tum(row: npt.ArrayLike) -> Pose:
 
 
 def to_local(T_odom_body: Pose, anchor: Floats) -> Pose:
-    """Return the same pose with the odometry frame's origin moved to ``anchor`` (3,), where float32 stays exact."""
+    """Return the same pose with the odometry frame's origin moved to ``anchor`` (3,), near which float32 is exact."""
     return pose_from(T_odom_body[:3, :3], T_odom_body[:3, 3] - anchor)
 
 
@@ -259,13 +259,13 @@ def rotate_covariance(covariance: Floats, R: Floats) -> Floats:
 
 
 def boxminus(T_map_body: Pose, T_map_reference: Pose) -> Floats:
-    """Return the step (6,) by which a pose differs from a reference, along the map's axes."""
+    """Return the step (6,) from a reference to a pose, along the map's axes."""
     turn = log_so3(T_map_body[:3, :3] @ T_map_reference[:3, :3].T)
     return np.asarray(np.concatenate([turn, T_map_body[:3, 3] - T_map_reference[:3, 3]]))
 
 
 def boxplus(T_map_body: Pose, step: Floats) -> Pose:
-    """Return the pose that differs by ``step`` (6,) along the map's axes; undoes :func:`boxminus`."""
+    """Return the pose moved by ``step`` (6,) along the map's axes; undoes :func:`boxminus`."""
     moved: Pose = T_map_body.copy()
     moved[:3, :3] = exp_so3(step[:3]) @ T_map_body[:3, :3]
     moved[:3, 3] += step[3:]
@@ -306,7 +306,7 @@ def log_se3(T: Poses) -> tuple[Floats, Floats]:
     """
     turn = log_so3(T[..., :3, :3])
     angle = np.sqrt((turn * turn).sum(axis=-1))[..., None, None]
-    small = angle < 0.03  # radians: below, the next terms of the series are smaller than its first by 1e-5
+    small = angle < 0.03  # radians, below which the next terms of the series are 1e-5 of its first
     half = 0.5 * np.where(small, 1.0, angle)
     slope, bend = half / np.tan(half), (half / np.sin(half)) ** 2
     mean = 0.5 * (slope - bend)
@@ -324,7 +324,7 @@ def log_se3(T: Poses) -> tuple[Floats, Floats]:
 
 @dataclass(frozen=True)
 class Circle:
-    """Circle in a horizontal plane, metres; it holds nothing beyond ``begin`` and ``end`` of x."""
+    """Circle in a horizontal plane, metres, cut to x from ``begin`` to ``end``."""
 
     x: float
     y: float
@@ -333,7 +333,7 @@ class Circle:
     end: float = math.inf
 
     def holds(self, positions: Reals) -> Bools:
-        """Tell which of positions (N, 2 or 3) lie within it, heights left out of account."""
+        """Return a mask of the positions (N, 2 or 3) within the circle, regardless of height."""
         x = positions[:, 0]
         away = np.asarray(positions[:, :2], dtype=np.float64) - (self.x, self.y)
         return np.asarray(((away * away).sum(axis=1) <= self.radius**2) & (x >= self.begin) & (x < self.end))
@@ -350,12 +350,12 @@ def quaternion_of(T: Pose) -> Floats:
 
 
 def stddev_of(covariance: Floats) -> Floats:
-    """Return one sigma (6,) of x, y, z, roll, pitch, yaw, metres and radians; NaN where a variance is not known."""
+    """Return one sigma (6,) of x, y, z, roll, pitch, yaw, metres and radians; NaN for an unknown variance."""
     return np.asarray(np.sqrt(np.diag(covariance)))
 
 
 def pose_fields(T: Pose, covariance: Floats | None) -> dict[str, Any]:
-    """Return a pose as plain data: position, orientation (quaternion) and covariance in rows, None where not known."""
+    """Return a pose as plain data: position, orientation (quaternion) and row-major covariance, None if unknown."""
     known = covariance is not None and not np.isnan(covariance).any()
     return {
         "position": position_of(T).tolist(),

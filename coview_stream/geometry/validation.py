@@ -1,6 +1,6 @@
-"""Checks of input: clouds, poses, stamps and covariances.
+"""Validation of input: clouds, poses, stamps and covariances.
 
-Arrays are copied where the caller may write into them again.
+Arrays are copied where the caller may reuse them.
 """
 
 from __future__ import annotations
@@ -18,25 +18,25 @@ from coview_stream.geometry.transforms import Points, Pose, is_pose, orthonormal
 _Real = TypeVar("_Real", np.float32, np.float64)
 
 MAX_COORDINATE = 1e8
-"""No coordinate on Earth, geocentric ones included, reaches this (metres); squares of it stay finite."""
+"""Limit in metres beyond all coordinates on Earth, even geocentric ones; squares of it stay finite."""
 
-# set by hand, all of them
+# all set by hand
 _MIN_POINTS = 10
-_SAMPLED_POINTS = 2000  # of a frame, to see how far they lie
-_MAX_DISTANCE = 10_000.0  # metres: no lidar sees this far, float32 is coarse there
-_MAX_FROM_MAP = 1e7  # metres from the map's origin: no place on this planet
-_MAX_STAMP = 1e11  # seconds, more than 3,000 years; today in milliseconds is above it
+_SAMPLED_POINTS = 2000  # sampled from a frame to find its extent
+_MAX_DISTANCE = 10_000.0  # metres: no lidar sees this far, and float32 is coarse there
+_MAX_FROM_MAP = 1e7  # metres from the map's origin: not on this planet
+_MAX_STAMP = 1e11  # seconds, more than 3,000 years; present stamps in milliseconds exceed it
 _MIN_EIGENVALUE = 1e-12  # of a correlation matrix
 
 
 def to_array(
     values: npt.ArrayLike, dtype: type[_Real], name: str, error: type[InputError] = CloudError
 ) -> npt.NDArray[_Real]:
-    """Return ``values`` as an array of ``dtype``, copied only if they are not; ``error`` if they are no numbers."""
+    """Return ``values`` as an array of ``dtype``, copied only if needed; ``error`` if they are no numbers."""
     try:
         with np.errstate(over="ignore"):
             array = np.asarray(values)
-            if array.dtype.kind in "bcmM":  # NumPy would turn them into numbers, a complex one by half
+            if array.dtype.kind in "bcmM":  # NumPy would convert them, dropping imaginary parts
                 raise TypeError(f"they are {array.dtype}")
             return array.astype(dtype, copy=False)
     except (TypeError, ValueError) as reason:
@@ -62,7 +62,7 @@ def cloud_rows(cloud: npt.ArrayLike) -> Points:
 
 
 def finite_rows(rows: Points) -> tuple[Points, Bools | None]:
-    """Return a copy of the finite rows (K, 3) of (N, 3), and which (N,) they are: None if all are."""
+    """Return a copy of the finite rows (K, 3) of (N, 3), and their mask (N,), None if all are finite."""
     if np.isfinite(rows).all():
         return rows.copy(order="C"), None
     finite: Bools = np.all(np.isfinite(rows), axis=1)
@@ -70,7 +70,7 @@ def finite_rows(rows: Points) -> tuple[Points, Bools | None]:
 
 
 def validate_cloud(cloud: npt.ArrayLike) -> Points:
-    """Return a frame's finite points, a copy (N, 3) float32 in rows; CloudError where it is no cloud."""
+    """Return a copy of a frame's finite points, row-major (N, 3) float32; CloudError if it is no cloud."""
     finite, _ = finite_rows(cloud_rows(cloud))
     if len(finite) < _MIN_POINTS:
         raise CloudError(f"cloud has {len(finite)} finite points; a frame needs {_MIN_POINTS} or more")
@@ -82,7 +82,7 @@ def validate_cloud(cloud: npt.ArrayLike) -> Points:
 
 
 def check_stamp(stamp: float, newest: float | None = None) -> None:
-    """Refuse a stamp that is no finite number of seconds, or not after that of the frame before (RunError)."""
+    """Refuse a stamp that is no finite number of seconds, or not after that of the previous frame (RunError)."""
     if isinstance(stamp, bool | np.bool_) or not isinstance(stamp, numbers.Real):
         raise RunError(f"stamp {stamp!r} is not numeric; give seconds, as a float")
     if not np.isfinite(stamp):
@@ -98,7 +98,7 @@ def check_stamp(stamp: float, newest: float | None = None) -> None:
 
 
 def check_rigid(T: npt.ArrayLike, name: str, error: type[InputError] = InputError) -> Pose:
-    """Return a rigid pose (4, 4) float64, orthonormal to the last digit; ``error`` for anything else."""
+    """Return a rigid pose (4, 4) float64, exactly orthonormal; ``error`` for anything else."""
     pose = to_array(T, np.float64, name, error)
     if not is_pose(pose):
         raise error(f"{name} {why_no_pose(pose)}")
@@ -108,7 +108,7 @@ def check_rigid(T: npt.ArrayLike, name: str, error: type[InputError] = InputErro
 def validate_odometry(T_odom_body: npt.ArrayLike, stamp: float, newest: float | None = None) -> Pose:
     """Return a frame's pose (4, 4), exactly rigid.
 
-    RunError where it is not, or its stamp is not finite, not in seconds or not after ``newest``.
+    RunError if it is not a pose, or its stamp is not finite, not in seconds or not after ``newest``.
     """
     check_stamp(stamp, newest)
     return check_rigid(T_odom_body, "T_odom_body", RunError)
@@ -117,7 +117,7 @@ def validate_odometry(T_odom_body: npt.ArrayLike, stamp: float, newest: float | 
 def validate_pose(T_map_body: npt.ArrayLike, origin: Floats) -> Pose:
     """Return a place (4, 4), given in the frame of the map's sources, about the map's ``origin`` (3,).
 
-    RunError where it is not rigid or not on this planet.
+    RunError if it is not rigid or not on this planet.
     """
     T = check_rigid(T_map_body, "T_map_body", RunError)
     local = pose_from(T[:3, :3], T[:3, 3] - origin)
@@ -127,7 +127,7 @@ def validate_pose(T_map_body: npt.ArrayLike, origin: Floats) -> Pose:
 
 
 def check_covariance(covariance: npt.ArrayLike, name: str) -> Floats:
-    """Return a covariance (6, 6) float64, symmetric to the last digit; InputError unless it is positive definite."""
+    """Return a covariance (6, 6) float64, exactly symmetric; InputError unless it is positive definite."""
     C = np.asarray(covariance, dtype=np.float64)
     if C.shape != (6, 6) or not np.isfinite(C).all():
         raise InputError(f"{name} has shape {C.shape} or is not finite; expected a covariance (6, 6)")

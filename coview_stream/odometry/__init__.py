@@ -1,1 +1,1 @@
-"""Odometry: a buffer of poses, deskewing, and lidar odometry for robots that have no other."""
+"""Odometry: a buffer of poses, deskewing, and lidar odometry for robots without any other."""

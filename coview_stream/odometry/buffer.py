@@ -1,4 +1,4 @@
-"""Buffer of a robot's odometry of the last seconds: continuity of its samples, and the pose at a frame's stamp."""
+"""Buffer of a robot's odometry of the last seconds: continuity of the samples, and the pose at a frame's stamp."""
 
 from __future__ import annotations
 
@@ -17,20 +17,20 @@ from coview_stream.messages.types import OdometryMessage
 
 _NS = 1_000_000_000
 
-_MIN_RESTART_SAMPLES = 5  # in a row, before a clock counts as restarted
+_MIN_RESTART_SAMPLES = 5  # successive samples before a clock counts as restarted
 # limits of a plausible step, set by hand
 _SLACK = 0.5  # metres: corrections by a lidar odometry, rough stamps
-_SLACK_SPEED = 3.0  # metres per second that any robot may gain
-_SPEED_FACTOR = 3.0  # times its speed of the last seconds
+_SLACK_SPEED = 3.0  # metres per second, gain of speed that any robot may have
+_SPEED_FACTOR = 3.0  # factor on the speed of the last seconds
 _SPEED_WINDOW_NS = 2 * _NS
-_MIN_SPEED_SPAN = 0.2  # seconds of samples: fewer give no speed
+_MIN_SPEED_SPAN = 0.2  # seconds of samples that give a speed
 _JUMP_ANGLE = np.radians(20.0)
 _MAX_TURN_RATE = 20.0  # radians per second; a faster turn of more than _JUMP_ANGLE is a jump
-_UNREACHABLE = 10.0  # seconds of outage that a connection that was down explains
+_UNREACHABLE = 10.0  # seconds of outage that a lost connection explains
 
 
 class SampleKind(StrEnum):
-    """Relation of an odometry sample to the samples before it."""
+    """Relation of an odometry sample to the previous samples."""
 
     CONTINUES = "continues"
     GAP = "gap"
@@ -87,7 +87,7 @@ class OdometryBuffer:
         self._discontinuous_since = float("inf")
 
     def continue_from(self, other: OdometryBuffer) -> None:
-        """Take over another buffer's samples, to detect poses that do not continue them."""
+        """Copy another buffer's samples, to detect poses that do not continue them."""
         self.newest, self.arrived = other.newest, other.arrived
         self.travelled, self.turned = other.travelled, other.turned
         self._samples = other._samples.copy()
@@ -95,12 +95,10 @@ class OdometryBuffer:
         self._discontinuous_since = other._discontinuous_since
 
     def add(self, sample: OdometryMessage, now: float, unreachable: bool = False) -> SampleKind:
-        """Add a sample and return its kind; duplicates and samples out of order are dropped.
+        """Add a sample and return its kind; duplicates and out-of-order samples are dropped.
 
-        Args:
-            sample: the sample.
-            now: local time (seconds) of its arrival.
-            unreachable: the connection was down since the last sample.
+        ``now`` is the local time of its arrival in seconds; ``unreachable`` if the connection was down since the last
+        sample.
         """
         longest = _UNREACHABLE if unreachable else self.config.max_outage
         step = None if self.newest is None else inverse(self.newest.T_odom_body) @ sample.T_odom_body
@@ -128,7 +126,7 @@ class OdometryBuffer:
         if sample.stamp_ns == last.stamp_ns:
             return SampleKind.DUPLICATE
         seconds = (sample.stamp_ns - last.stamp_ns) / _NS
-        # a single stray stamp must not exclude all later ones, so one far ahead has to be confirmed as well
+        # a single stray stamp must not exclude all later ones, so one far ahead needs confirmation, too
         ahead = seconds > self.config.odometry_history + 2.0 * (now - self.arrived)
         if seconds < 0 or ahead:
             if not self._is_new_sequence(sample.stamp_ns, now):
@@ -143,7 +141,7 @@ class OdometryBuffer:
         return SampleKind.GAP if seconds > self.config.odometry_timeout else SampleKind.CONTINUES
 
     def _is_new_sequence(self, stamp_ns: int, now: float) -> bool:
-        """Tell whether the samples that do not continue the buffer have continued one another for long enough."""
+        """Return whether the samples that do not continue the buffer have continued each other for long enough."""
         if self._discontinuous and stamp_ns <= self._discontinuous[-1]:
             self._discontinuous.clear()
         if not self._discontinuous:
@@ -155,7 +153,7 @@ class OdometryBuffer:
         )
 
     def _max_plausible_speed(self) -> float:
-        """Return a limit of the robot's speed, metres per second, by its last seconds; infinite while unknown."""
+        """Return a limit on the robot's speed, metres per second, by its last seconds; infinite while unknown."""
         newest = self._samples[-1]
         first = self._samples[bisect_left(self._samples, newest.stamp_ns - _SPEED_WINDOW_NS, key=lambda s: s.stamp_ns)]
         seconds = (newest.stamp_ns - first.stamp_ns) / _NS

@@ -1,4 +1,4 @@
-"""Deskewing: a sweep's points moved to their places in the body frame at the frame's stamp."""
+"""Deskewing: moves a sweep's points to their positions in the body frame at the frame's stamp."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from coview_stream.geometry.transforms import Points, Pose, interpolate, inverse
 from coview_stream.odometry.buffer import Segment
 
 _STEPS = 128  # poses along the sweep: 0.8 ms of a 10 Hz sweep, a centimetre at 12 m/s
-_INSTANT = 1e-4  # seconds: times that differ by less are one
+_INSTANT = 1e-4  # seconds; smaller time differences are ignored
 
 
 @dataclass(frozen=True)
@@ -19,8 +19,8 @@ class SweepCorrection:
     """Calibration of sensor and odometry, for deskewing a sweep.
 
     Attributes:
-        R_body_cloud: (3, 3) rotation that levels clouds of a sensor that leans against the body.
-        scale: factor that corrects odometry's distances, minus one.
+        R_body_cloud: (3, 3) rotation that levels clouds of a leaning sensor.
+        scale: correction factor of odometry's distances, minus one.
     """
 
     R_body_cloud: Floats
@@ -39,11 +39,11 @@ def deskew(
 
     Args:
         points: (N, 3) float32, each in the body frame at its own time, metres.
-        times: (N,) seconds after ``stamp_ns`` (before: negative). Times outside the segment take its nearest end.
+        times: (N,) seconds after ``stamp_ns`` (negative before). Times outside the segment take its nearest end.
         segment: odometry that covers the sweep; with fewer than two samples nothing moves.
         stamp_ns: the frame's stamp.
         T_odom_body: (4, 4) odometry at that stamp.
-        correction: of a sensor that leans against the body and of odometry; default none.
+        correction: of a leaning sensor and of odometry; default none.
     """
     if len(segment.stamps) < 2 or not len(points):
         return points

@@ -1,11 +1,11 @@
 """Gravity's direction in the body frame, from the ground around a lidar and the walls on it.
 
-The ground is a plane through the lowest points. Its normal is gravity's direction only where the ground is level;
-walls are vertical on slopes, too, and correct it. On a slope without walls the odometry frame leans with the slope.
+The ground is a plane through the lowest points. Its normal is gravity's direction only where the ground is level. Walls
+are vertical on slopes, too, and correct it. On a slope without walls the odometry frame leans with the slope.
 
 Measured once, by no command of this repository, on nine simulated worlds, 20 frames each (town, campus, village,
-industrial; vlp16, os64, mid360): the ground's normal leans 0.4 to 4.1 degrees against gravity (medians), corrected by
-the walls 0.05 to 0.33. The walls of these worlds are exactly vertical.
+industrial; vlp16, os64, mid360): the ground's normal leans by 0.4 to 4.1 degrees against gravity (medians), by 0.05 to
+0.33 when corrected by the walls. The walls of these worlds are exactly vertical.
 """
 
 from __future__ import annotations
@@ -18,17 +18,17 @@ from coview_stream.config.odometry import MAX_TILT
 from coview_stream.geometry.arrays import Floats, Indices, Reals
 
 SLOPE = float(np.radians(4.0))
-"""One sigma of the lean of the ground's normal, radians, after the figures above."""
+"""One sigma of the lean of the ground's normal, radians, from these figures."""
 
 # the ground; set by hand
 _REACH = 25.0  # metres around the sensor
-_CELL = 1.0  # metres, of cells with their lowest point
+_CELL = 1.0  # metres, of cells from which the lowest points are taken
 _BAND = 0.15  # metres to both sides of the plane
 _MIN_HEIGHT = 0.1  # metres of the sensor above the ground
 _TRIALS = 400  # planes through three points
 _REFINEMENTS = 5
 _MIN_CELLS = 40
-_MIN_SHARE = 0.4  # of the cells in the plane
+_MIN_SHARE = 0.4  # of the cells, in the plane
 _MAX_BELOW = 0.25  # share of the cells below the plane: a table top is not the ground
 _MIN_EXTENT = 2.0  # metres, one sigma, of the ground's cells along the shorter axis
 
@@ -40,10 +40,10 @@ _WALL_MIN_POINTS = 8
 _WALL_MAX_THICKNESS = 0.04  # metres, one sigma, off the plane
 _WALL_MIN_WIDTH = 0.2  # metres, one sigma, along the shorter axis in the plane
 _WALL_MAX_LEAN = np.sin(np.radians(15.0))
-_WALL_SIGMA = np.radians(2.0)  # of a patch; a larger lean counts less and less
+_WALL_SIGMA = np.radians(2.0)  # of a patch; larger leans count less and less
 _WALL_ROUNDS = 10
-_WIDE = float(np.radians(10.0))  # sigma of the direction that a search for walls starts with
-_UNSEEN = float(np.radians(30.0))  # sigma of the walls' vertical along the direction that they all face
+_WIDE = float(np.radians(10.0))  # initial sigma of the direction in a search for walls
+_UNSEEN = float(np.radians(30.0))  # sigma of the walls' vertical in the direction that all walls face
 
 
 @dataclass(frozen=True)
@@ -52,13 +52,13 @@ class Ground:
 
     up: Floats  # (3,) unit vector in the body frame: the plane's normal, corrected by walls
     height: float  # of the sensor above it, metres
-    share: float  # of the cells around with their lowest point in it
+    share: float  # of the surrounding cells, with the lowest point in the plane
     cells: int  # number of these cells
-    walls: int = 0  # number of patches of wall behind up
+    walls: int = 0  # number of wall patches that corrected ``up``
 
 
 def find_ground(points: Reals) -> Ground | str:
-    """Find the ground in a cloud (N, 3), body frame with z about up, metres; or return the reason for none."""
+    """Find the ground in a cloud (N, 3), body frame with z about up, metres; else return the reason."""
     ground = ground_plane(points)
     if isinstance(ground, str):
         return ground
@@ -67,7 +67,7 @@ def find_ground(points: Reals) -> Ground | str:
 
 
 def ground_plane(points: Reals, near: Ground | None = None) -> Ground | str:
-    """Find the ground without its walls; arguments as :func:`find_ground`, ``near`` an expected ground to try first."""
+    """Find the ground without walls; arguments as in :func:`find_ground`, ``near`` an expected ground to try first."""
     points = np.asarray(points, dtype=np.float64)
     points = points[(points[:, :2] ** 2).sum(axis=1) < _REACH**2]
     cell = np.floor(points[:, :2] / _CELL).astype(np.int64) @ np.array([1 << 20, 1])
@@ -87,7 +87,7 @@ def _checked(lowest: Floats, plane: tuple[Floats, float] | None) -> Ground | str
     if plane is None:
         return "no plane below the sensor fits three of the lowest points"
     up, height = plane
-    if up[2] < np.cos(MAX_TILT) or height < _MIN_HEIGHT:  # refinement moved it there
+    if up[2] < np.cos(MAX_TILT) or height < _MIN_HEIGHT:  # moved there by refinement
         return "the best plane does not lie below the sensor"
     above = lowest @ up + height
     inside = np.abs(above) < _BAND
@@ -103,20 +103,20 @@ def _checked(lowest: Floats, plane: tuple[Floats, float] | None) -> Ground | str
 
 
 def gravity_from_walls(points: Reals, up: Floats) -> tuple[Floats, int]:
-    """Correct ``up`` (3,), which ground gave, by the walls in a cloud (N, 3), metres; and count their patches.
+    """Correct ``up`` (3,), found by the ground, by the walls in a cloud (N, 3), metres; count their patches, too.
 
-    Directions that the walls leave open stay.
+    Directions without walls stay unchanged.
     """
     better, _, count = wall_evidence(points, up, SLOPE)
     return better, count
 
 
 def wall_evidence(points: Reals, up: Floats, sigma: float) -> tuple[Floats, Floats, int]:
-    """Return ``up`` corrected by walls, their information (3, 3), 1 / radians^2, and the number of their patches."""
+    """Return ``up`` corrected by walls, their information matrix (3, 3), 1 / radians^2, and their number of patches."""
     normals = _patches(points[:: 1 + len(points) // _WALL_POINTS].astype(np.float64), up)
     better, walls = up, np.zeros((3, 3))
     for _ in range(_WALL_ROUNDS):
-        weights = 1.0 / (_WALL_SIGMA**2 + (normals @ better) ** 2)  # Cauchy's: a car's door is no wall
+        weights = 1.0 / (_WALL_SIGMA**2 + (normals @ better) ** 2)  # Cauchy's, as a car's door is no wall
         walls = (normals.T * weights) @ normals
         better = np.linalg.solve(walls + np.eye(3) / sigma**2, up / sigma**2)
         better /= np.linalg.norm(better)
@@ -131,12 +131,12 @@ def level_rotation(up: Floats) -> Floats:
 
 
 def _consensus_plane(lowest: Floats) -> tuple[Floats, float] | None:
-    """Return the plane with the most points of many through three points (RANSAC)."""
-    rng = np.random.default_rng(0)  # equal clouds have equal grounds
+    """Return the plane with the most points among planes through three random points (RANSAC)."""
+    rng = np.random.default_rng(0)  # the same cloud gives the same ground
     a, b, c = np.moveaxis(lowest[rng.integers(len(lowest), size=(_TRIALS, 3))], 1, 0)
     normals = np.cross(b - a, c - a)
     lengths = np.linalg.norm(normals, axis=1)
-    usable = lengths > 1.0  # square metres, twice the triangle's: slivers say nothing
+    usable = lengths > 1.0  # square metres, twice the triangle's area; slivers are ill-conditioned
     normals = normals[usable] / lengths[usable, None] * np.sign(normals[usable, 2:])
     heights = -(normals * a[usable]).sum(axis=1)
     ground = (normals[:, 2] > np.cos(MAX_TILT)) & (heights > _MIN_HEIGHT)
@@ -164,7 +164,7 @@ def _refined(lowest: Floats, plane: tuple[Floats, float] | None) -> tuple[Floats
 
 
 def _patches(points: Floats, up: Floats) -> Floats:
-    """Return normals (K, 3) of the flat, roughly upright patches of surface."""
+    """Return normals (K, 3) of the flat, roughly upright surface patches."""
     near = points[(points**2).sum(axis=1) < _WALL_REACH**2]
     cell = np.floor(near / _WALL_CELL).astype(np.int64) @ np.array([1 << 40, 1 << 20, 1])
     _, cell_of, count = np.unique(cell, return_inverse=True, return_counts=True)
@@ -187,7 +187,7 @@ class Plumb:
     """The vertical by the surrounding surfaces, in level axes, for a filter."""
 
     walls: Floats | None  # (2,) x and y of the unit vector along the walls; None without walls
-    covariance: Floats  # (2, 2) of it, radians squared, but for a factor
+    covariance: Floats  # (2, 2) of ``walls``, radians squared, up to a factor
     ground: Floats | None  # (2,) x and y of the ground's unit normal; None without ground
 
     def rows(self) -> tuple[Floats, Indices]:
@@ -201,18 +201,18 @@ class Surfaces:
     """Walls and ground around one frame, in its body frame."""
 
     walls: Floats | None  # (3,) unit vector along the walls; None without walls
-    information: Floats  # (3, 3) of it, 1 / radians squared
+    information: Floats  # (3, 3) of ``walls``, 1 / radians squared
     ground: Ground | None  # None without ground
 
     @classmethod
     def around(cls, points: Reals, up: Floats, near: Ground | None) -> Surfaces:
-        """Measure in a frame (N, 3), metres, with ``up`` (3,) right to some degrees and the last ground ``near``."""
+        """Measure in a frame (N, 3), metres, with ``up`` (3,) exact to some degrees and the last ground ``near``."""
         walls, information, count = wall_evidence(points, up, _WIDE)
         plane = ground_plane(points, near)
         return cls(walls if count else None, information, None if isinstance(plane, str) else plane)
 
     def seen(self, R: Floats) -> Plumb:
-        """Return the vertical in axes that are level but for a small tilt; ``R`` (3, 3): these axes <- body."""
+        """Return the vertical in level axes, up to a small tilt; ``R`` (3, 3) is these axes <- body."""
         information = (R @ self.information @ R.T)[:2, :2] + np.eye(2) / _UNSEEN**2
         return Plumb(
             None if self.walls is None else (R @ self.walls)[:2],

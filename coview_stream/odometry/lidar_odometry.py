@@ -1,4 +1,4 @@
-"""Odometry from lidar frames alone: each frame is registered to a local map of the earlier ones."""
+"""Odometry from lidar frames alone: each frame is registered to a local map of earlier frames."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ class ScanRegistration(Protocol):
     """Registration of frames to a local map that grows with them."""
 
     def register(self, points: Floats, guess: Pose) -> Pose:
-        """Return the pose (4, 4) of a deskewed frame (N, 3), local map <- body, from a guess near it; add the frame."""
+        """Return the pose (4, 4) of a deskewed frame (N, 3), local map <- body, from a guess nearby; add the frame."""
         ...
 
     def clear(self) -> None:
@@ -45,13 +45,13 @@ class ScanRegistration(Protocol):
 class KissRegistration:
     """kiss-icp's (MIT; Vizzo et al., RA-L 2023) point-to-point ICP against its voxel map, with its adaptive threshold.
 
-    kiss-icp 1.3.0 aborts the interpreter (``SOPHUS_ENSURE failed``) where all time stamps are equal or one is not
-    finite, and refers its deskewed frames to the sweep's end or middle, by version. So it gets no time stamps, and the
-    frames come deskewed to the frame's stamp by :func:`~coview_stream.odometry.deskew.deskew`.
+    kiss-icp 1.3.0 aborts the interpreter (``SOPHUS_ENSURE failed``) if all time stamps are equal or one is not finite,
+    and refers its deskewed frames to the sweep's end or middle, depending on the version. So it gets no time stamps,
+    and frames that :func:`~coview_stream.odometry.deskew.deskew` has moved to the frame's stamp.
     """
 
     def __init__(self, config: LidarOdometryConfig) -> None:
-        """Prepare kiss-icp; DependencyError where it is missing."""
+        """Prepare kiss-icp; DependencyError if it is missing."""
         pipeline, configuration = (
             require_library(f"kiss_icp.{name}", "kiss-icp>=1.2", "lidar odometry") for name in ("kiss_icp", "config")
         )
@@ -66,44 +66,43 @@ class KissRegistration:
         self.clear()
 
     def register(self, points: Floats, guess: Pose) -> Pose:
-        """As of :class:`ScanRegistration`."""
+        """See :class:`ScanRegistration`."""
         icp = self._icp
-        # register_frame predicts by the last motion, without times, so this carries the guess
+        # register_frame predicts by the last motion, without times, so this passes the guess
         icp.last_delta = inverse(icp.last_pose) @ guess
         icp.register_frame(points, np.zeros(0))
         return np.array(icp.last_pose, dtype=np.float64)
 
     def clear(self) -> None:
-        """As of :class:`ScanRegistration`."""
+        """See :class:`ScanRegistration`."""
         self._icp = self._make()
 
 
-_MIN_MOTION_SECONDS = 0.02  # a motion over less is mostly noise
+_MIN_MOTION_SECONDS = 0.02  # shorter motions are mostly noise
 _MIN_SWEEP_SECONDS = 1e-4  # shorter sweeps are instants
-_MAX_SWEEP_SECONDS = 1.0  # from the stamp: points farther away in time have another clock
-_CONVERGENCE, _ITERATIONS = 1e-3, 60  # step, metres and radians, below which registration ends; at most so many
+_MAX_SWEEP_SECONDS = 1.0  # from the stamp; points farther away in time have another clock
+_CONVERGENCE, _ITERATIONS = 1e-3, 60  # step, metres and radians, below which registration ends, and limit
 _MAX_TURN_RATE = 4.0  # radians per second: registration may spin with its own prediction
-_SLACK, _SLACK_ANGLE = 0.5, np.radians(20.0)  # metres and radians that a registration may always move
-_FOUND_GRAVITY = float(np.radians(10.0))  # one sigma before the first frame; walls and ground there reduce it
+_SLACK, _SLACK_ANGLE = 0.5, np.radians(20.0)  # metres and radians that a registration may move in any case
+_FOUND_GRAVITY = float(np.radians(10.0))  # one sigma before the first frame, whose walls and ground reduce it
 _GIVEN_GRAVITY = float(np.radians(0.5))  # one sigma of a direction from the user
 _SHAKE = float(np.radians(2.0))  # one sigma of a body's tilt from one frame to the next, set by hand
-_SHAKE_SECONDS = 0.1  # between these frames; over longer, it is a random walk
+_SHAKE_SECONDS = 0.1  # between these frames; a random walk over longer times
 
 
 class LidarOdometry:
     """Poses of a lidar's body frame in a gravity-aligned odometry frame, from its frames alone.
 
-    The odometry frame has z up, and its origin and the level direction of its x are the body's at the first usable
-    frame. It drifts, but not in tilt where there are walls (:mod:`~coview_stream.odometry.tilt_filter`). The last
-    motion, scaled to the time between stamps, predicts the next one and deskews the frame. ``docs/results.md`` has the
-    costs; kiss-icp holds the interpreter lock.
+    The odometry frame has z up; its origin and the level direction of its x are the body's at the first usable frame.
+    It drifts, but not in tilt where there are walls (:mod:`~coview_stream.odometry.tilt_filter`). The last motion,
+    scaled to the time between stamps, predicts the next one and deskews the frame. ``docs/results.md`` has the costs;
+    kiss-icp holds the interpreter lock.
 
     Attributes:
         config: the settings.
-        ground: the plane behind gravity's direction; None before the first frame, and where gravity was given.
+        ground: the plane behind gravity's direction; None before the first frame, and with given gravity.
         points: (N, 3) float32, the finite points of the newest frame, deskewed: input of a ``Localizer``.
-        restarts: number of restarts of the local map, after a gap or an impossible motion; the odometry lacks the
-            robot's motion meanwhile.
+        restarts: number of restarts of the local map, after a gap or an impossible motion, which the odometry lacks.
     """
 
     def __init__(self, config: LidarOdometryConfig | None = None, registration: ScanRegistration | None = None) -> None:
@@ -117,17 +116,17 @@ class LidarOdometry:
         self.reset()
 
     def reset(self) -> None:
-        """Forget all frames: the next one begins another odometry frame."""
+        """Forget all frames; the next one starts another odometry frame."""
         self.ground: Ground | None = None
         self.points: Points = np.empty((0, 3), dtype=np.float32)
         self.restarts = 0
         self._pose: Pose | None = None
-        self._local = np.eye(4)  # the pose by registration in the local map, whose tilt drifts
+        self._local = np.eye(4)  # pose by registration in the local map, whose tilt drifts
         self._T_odom_local = np.eye(4)
         self._ground: Ground | None = None  # of the newest frame that had one
         self._tilt = TiltFilter(_FOUND_GRAVITY if self.config.gravity == "ground" else _GIVEN_GRAVITY)
         self._stamp = 0.0
-        self._step, self._step_seconds = np.eye(4), 1.0  # the last motion, over these seconds
+        self._step, self._step_seconds = np.eye(4), 1.0  # last motion, and its duration
         self._registration.clear()
 
     def step(self, points: Points, point_times: Floats | None, stamp: float) -> Pose:
@@ -135,17 +134,17 @@ class LidarOdometry:
 
         Args:
             points: (N, 3) body frame (x forward, z up), metres; rows with NaN are dropped.
-            point_times: (N,) seconds of the points after ``stamp`` (before: negative); None for a deskewed frame. Equal
-                times deskew nothing; a point with a time that is not finite stays.
+            point_times: (N,) seconds of the points after ``stamp`` (negative before); None for a deskewed frame. Equal
+                times deskew nothing; a point whose time is not finite stays.
             stamp: seconds, later than the stamp of the previous frame.
 
         Returns:
             ``T_odom_body`` (4, 4) at ``stamp``.
 
         Raises:
-            CloudError: too few points in range, another shape, no ground to take gravity from, or a motion that no
-                robot makes. RunError: the stamp is not finite or not later than the previous one. After either, skip
-                the frame and go on.
+            CloudError: too few points in range, another shape, no ground that gives gravity, or a motion that no robot
+                makes. RunError: the stamp is not finite or not later than the previous one. After either, skip the
+                frame and continue.
         """
         finite, times = _validated(points, point_times, self.config)
         check_stamp(stamp)
@@ -163,7 +162,7 @@ class LidarOdometry:
         if times is not None and (sweep := self._sweep(times)) is not None:
             finite = deskew(finite, times, sweep, 0, np.eye(4))
         around = self._surfaces(finite, guess) if self.config.keep_level else None
-        if around is not None:  # a body shakes unpredictably: tilt the guess by the frame's own walls and ground
+        if around is not None:  # the body shakes, so tilt the guess by the frame's own walls and ground
             R = self._T_odom_local[:3, :3]
             tilt = self._tilt.expected(around.seen(R @ guess[:3, :3]), _SHAKE)
             guess = pose_from(R.T @ upright(tilt) @ R @ guess[:3, :3], guess[:3, 3])
@@ -205,7 +204,7 @@ class LidarOdometry:
         return around
 
     def _level(self, around: Surfaces, metres: float, since: Since) -> None:
-        """Remove registration's tilt from the newest pose, and turn the odometry frame about it, slowly."""
+        """Remove registration's tilt from the newest pose, and slowly rotate the odometry frame about it."""
         assert self._pose is not None
         R, here = self._pose[:3, :3], self._pose[:3, 3]
         tilt = upright(self._tilt.update(around.seen(R), metres, since))
@@ -227,7 +226,7 @@ class LidarOdometry:
         return Segment(stamps, np.array([self._predicted_motion(t) for t in ends]))
 
     def _check_motion(self, step: Pose, seconds: float) -> None:
-        """Refuse a motion that no robot makes; restart the local map, which holds the frame at a wrong place."""
+        """Refuse a motion that no robot makes; restart the local map, which contains the frame at a wrong place."""
         far, wide = float(np.linalg.norm(step[:3, 3])), rotation_angle(step)
         allowed = _SLACK + self.config.max_speed * seconds
         if is_pose(step) and far <= allowed and wide <= max(_SLACK_ANGLE, _MAX_TURN_RATE * seconds):
@@ -248,7 +247,7 @@ class LidarOdometry:
 
 
 def _validated(points: Points, times: Floats | None, config: LidarOdometryConfig) -> tuple[Points, Floats | None]:
-    """Return the finite points, a copy (N, 3) float32, and their times (N,); CloudError as of ``step``."""
+    """Return a copy of the finite points (N, 3) float32, and their times (N,); CloudError as in ``step``."""
     rows = cloud_rows(points)
     at = None if times is None else to_array(times, np.float64, "times")
     if at is not None and at.shape != (len(rows),):

@@ -1,8 +1,8 @@
-"""Tilt of lidar odometry against gravity, as a state that changes slowly: a Kalman filter over the up direction.
+"""Tilt of lidar odometry against gravity as a slowly changing state: a Kalman filter over the up direction.
 
 Registration gives each frame a roll and a pitch in its local map; walls are vertical there and the ground has a
-normal. Directions near z are written by their x and y, in the axes of the local map after all turns so far. For frame
-k, two numbers each (radians):
+normal. Directions near z are given by their x and y, in the axes of the local map after all turns so far. For frame k,
+two numbers each (radians):
 
     d_k = d_{k-1} + drift          of the local map; drift ~ N(0, 0.2^2 N)
     n_k ~ N(0, N)                  of this frame in the local map: registration's error, forgotten with the frame
@@ -15,19 +15,19 @@ k, two numbers each (radians):
     up by ground   z_s = d + n + s
     tilted since   z_m = n + m     the last frame, by its reported pose
 
-The filter turns d out of the odometry frame, slowly, and n out of this frame alone. So a frame's jitter is that of the
-better witness: where registration has 0.03 degrees and walls 1, n stays 0; where rings on bare ground hold registration
-fast while the robot shakes, walls and ground outvote it.
+The filter removes d from the odometry frame, slowly, and n from this frame alone. So a frame's jitter is that of the
+better witness: where registration has 0.03 degrees and walls 1, n stays 0; where rings on bare ground keep registration
+fixed while the robot shakes, walls and ground outvote it.
 
 The variances are learnt from three witnesses of one direction (Gray and Allan's three-cornered hat): N, Q and kappa are
 estimated from the innovations, each as the sum of its squared shares over its redundancy (Foerstner's variance
 components), fading over 60 frames. n, v and w have Student's t distribution with 4 degrees of freedom: a kerb taken for
 the ground, or a parked lorry for a wall, is outvoted in that frame. So is a registration that turns a covered sensor
-over by 27 degrees: it may be that wrong, the body cannot be that fast. Such a likelihood has several maxima; the search
-starts twice, with n as usual and with n an outlier.
+over by 27 degrees: it may be that wrong, but the body cannot be that fast. Such a likelihood has several maxima, so the
+search starts twice, with n as usual and with n an outlier.
 
-Per frame the odometry frame turns by at most 1.5 times the presumed drift of the local map: late knowledge of gravity
-(after a first frame on a slope) comes in slowly, without a jump of the pose.
+Per frame the odometry frame turns by at most 1.5 times the presumed drift of the local map, so that late knowledge of
+gravity (after a first frame on a slope) enters slowly, without a jump of the pose.
 """
 
 from __future__ import annotations
@@ -43,11 +43,11 @@ from coview_stream.odometry.gravity import SLOPE, Plumb
 
 # set by hand
 _DRIFT = 0.2  # of the local map per frame, as a share of the frame's error
-_LEAST_DRIFT = float(np.radians(0.005))  # at least: 0.15 degrees in 100 s at 10 Hz if it has no direction
-_MAX_TURN = 1.5  # sigmas of that drift that the odometry frame turns per frame
+_LEAST_DRIFT = float(np.radians(0.005))  # lower limit: 0.15 degrees in 100 s at 10 Hz without a preferred direction
+_MAX_TURN = 1.5  # sigmas of that drift, largest turn of the odometry frame per frame
 _FRAME_TILT = float(np.radians(0.2))  # initial sigma of a frame's tilt by registration
-_SLOPE_STEP = float(np.radians(0.5))  # likewise of the ground's slope, from frame to frame
-_WALL_METRES = 10.0  # with the same error of the walls
+_SLOPE_STEP = float(np.radians(0.5))  # likewise of the change of the ground's slope per frame
+_WALL_METRES = 10.0  # over which the walls' error stays the same
 _NO_WALLS = float(np.radians(2.0))  # sigma of the walls' common error, without walls
 _LEAST = float(np.radians(0.01))  # least sigma
 _LEAST_KAPPA = 1e-3
@@ -69,7 +69,7 @@ _OF_BODY = np.vstack([_ZERO, _ZERO, _EYE])
 
 @dataclass(frozen=True)
 class Since:
-    """Tilt of a frame's body axis z against the axis of the previous frame."""
+    """Tilt of a frame's body z axis against that of the previous frame."""
 
     tilt: Floats  # (2,) difference of the axes' x and y in the level frame
     sigma: float  # of the body's tilt meanwhile, radians
@@ -118,7 +118,7 @@ class TiltFilter:
         self._first = True
 
     def expected(self, plumb: Plumb, sigma: float) -> Floats:
-        """Return the tilt (2,) of a frame with a guessed pose of ``sigma`` radians; nothing is learnt."""
+        """Return the tilt (2,) of a frame with a guessed pose of ``sigma`` radians, without learning."""
         x, P, slope = self._predicted(plumb, 0.0)
         return self._split(x, P, plumb, sigma**2, slope)[0]
 
@@ -142,7 +142,7 @@ class TiltFilter:
         return tilt
 
     def _drift(self) -> float:
-        """Return one sigma of the local map's drift in a frame, radians."""
+        """Return one sigma of the local map's drift per frame, radians."""
         return max(_LEAST_DRIFT, _DRIFT * self.frame_tilt)
 
     def _predicted(self, plumb: Plumb, metres: float) -> tuple[Floats, Floats, float]:
@@ -201,18 +201,18 @@ class TiltFilter:
 def _reweighted(
     innovation: Floats, normal: Floats, errors: list[Floats], ways: list[Floats], weights: tuple[float, ...]
 ) -> tuple[float, Floats, Floats, list[Floats], list[Floats], list[Floats]]:
-    """Find a maximum of the likelihood of an innovation (K,) that several errors share (EM), from ``weights``.
+    """Find a maximum of the likelihood of an innovation (K,) with several error sources (EM), from ``weights``.
 
     Args:
         innovation: sum of a normal part and the errors.
-        normal: (K, K) covariance of its normal part.
+        normal: (K, K) covariance of the normal part.
         errors: (2, 2) covariances of the errors with Student's t distribution, all zero for none.
         ways: (K, 2) Jacobians of the innovation by the errors.
         weights: initial divisors of the errors' covariances.
 
     Returns:
-        Minus the log-likelihood but for a constant, the innovation's inverse covariance, its product with the
-        innovation, and for each error its weighted covariance, its share (2,) and its remaining covariance.
+        Minus the log-likelihood up to a constant, the innovation's inverse covariance, its product with the innovation,
+        and for each error its weighted covariance, its share (2,) and its remaining covariance.
     """
     for _ in range(_ROUNDS):
         wide = [C / weight for C, weight in zip(errors, weights, strict=True)]
@@ -233,7 +233,7 @@ def _reweighted(
 
 
 def upright(tilt: Floats) -> Floats:
-    """Return the rotation (3, 3) that turns the direction with x and y ``tilt`` (2,), z up, to z the shortest way."""
+    """Return the shortest rotation (3, 3) that takes the direction with x and y ``tilt`` (2,), z up, to z."""
     axis = np.array([tilt[1], -tilt[0], 0.0])
     sine = float(np.linalg.norm(axis))
     return exp_so3(axis * (np.arcsin(min(1.0, sine)) / sine if sine > 0.0 else 1.0))

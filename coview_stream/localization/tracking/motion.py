@@ -193,7 +193,7 @@ class OdometryTracker:
         return inverse(self._keyframe.T_odom_body) @ T_odom_body
 
     def change(self) -> Floats:
-        """Return the derivative (3,) by the delay, seconds, of the motion since the newest keyframe, axes of its start."""
+        """Return the derivative (3,) by the delay, seconds, of the motion since the newest keyframe, start axes."""
         motion = np.eye(4) if self.pose is None else self.motion(self.pose)
         return np.asarray(motion_jacobian(motion, np.array([_rates(self._keyframe.moment), self.rates]))[:, 2])
 

@@ -125,7 +125,7 @@ class _Parting:
     seconds: float = 0.0  # since its start
 
     def beyond(self, lag: float) -> float:
-        """Return the probability under the hypothesis that the clouds are off by more than ``lag`` seconds either way."""
+        """Return the probability, under the hypothesis, that the clouds are off by over ``lag`` seconds either way."""
         sigma = math.sqrt(2.0) * max(self.sigma * self.seconds, float(LAGS[1]) / 2.0)
         return 1.0 - 0.5 * (math.erf((lag - self.lag) / sigma) + math.erf((lag + self.lag) / sigma))
 
