@@ -89,8 +89,7 @@ def _ground(points: Points, grid: OverheadGrid, lowest: Floats32) -> tuple[Float
     eroded = ndimage.grey_erosion(lowest, structure=cone, mode="constant", cval=np.inf)
     ground = filled(np.where(np.isfinite(eroded), eroded, np.nan).astype(np.float32))
     ground = ndimage.median_filter(ground, 3)
-    # a sloping cell's lowest point is below the height at its middle: the mean of the points near the ground corrects
-    # that
+    # the lowest point of a sloping cell is below its middle: the mean of the points near the ground corrects that
     count, total = kernels.offsets_near(points, grid, ground, _GROUND_BAND)
     ground = ndimage.gaussian_filter((ground + total / np.maximum(count, 1)).astype(np.float32), 0.5)
     level = occupied & (count > 0)

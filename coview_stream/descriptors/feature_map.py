@@ -110,7 +110,7 @@ class FeatureMap:
         return np.asarray((self.index.tiles + 0.5) * (TILE * LOCAL_CELL), dtype=np.float64)
 
     def patch(self, centre: Reals, reach: float) -> Patch:
-        """Return the features within ``reach`` metres of ``centre`` (x and y, map frame), rounded to whole cells."""
+        """Return the features within ``reach`` metres of ``centre`` (x and y, map frame), out to whole cells."""
         middle = np.asarray(centre, dtype=np.float64)[:2]
         low = np.floor((middle - reach) / LOCAL_CELL).astype(np.int64)
         high = np.ceil((middle + reach) / LOCAL_CELL).astype(np.int64)

@@ -1,7 +1,7 @@
 """Rasters: points by cell, window minima and maxima, and filled gaps.
 
 SciPy has such filters too, but its import takes a quarter of a second of a node's start. So only :func:`filled`, which
-builds maps, imports it, when called.
+builds maps, imports it when called.
 """
 
 from __future__ import annotations

@@ -5,11 +5,10 @@ p_source``. Metres and radians throughout; quaternions are x, y, z, w. Rotations
 them too, but its import takes half a second of a node's start, which should take two.
 
 A small motion of a pose has six numbers (rx, ry, rz, x, y, z) *along the map's axes*: the body rotates about its own
-origin, then is shifted, ``R -> exp(r) R`` and ``t -> t + s``. A pose graph's tangent is the *body's*, on the right, ``T
--> T exp(xi)`` with xi = (rotation, translation) along the body's axes. To first order, which is all that a covariance
-describes, both are the same motions: r = R xi_r and s = R xi_t. So a covariance is converted by the rotation alone,
-diag(R, R) C diag(R, R)^T. (The whole adjoint, with its lever arm [t]x R, would belong to rotations about the map's
-origin.)
+origin, then is shifted, ``R -> exp(r) R`` and ``t -> t + s``. A pose graph's tangent is the *body's*, on the right:
+``T -> T exp(xi)`` with xi = (rotation, translation) along the body's axes. To first order, which is all that a
+covariance describes, both are the same motions: r = R xi_r and s = R xi_t. So a covariance is converted by the rotation
+alone, diag(R, R) C diag(R, R)^T. (The whole adjoint, with its lever arm [t]x R, is for rotations about the map origin.)
 """
 
 from __future__ import annotations

@@ -206,7 +206,7 @@ class Surfaces:
 
     @classmethod
     def around(cls, points: Reals, up: Floats, near: Ground | None) -> Surfaces:
-        """Measure in a frame (N, 3), metres, with ``up`` (3,) exact to some degrees and the last ground ``near``."""
+        """Measure in a frame (N, 3), metres, with ``up`` (3,) known to some degrees and the last ground ``near``."""
         walls, information, count = wall_evidence(points, up, _WIDE)
         plane = ground_plane(points, near)
         return cls(walls if count else None, information, None if isinstance(plane, str) else plane)

@@ -81,7 +81,7 @@ class KissRegistration:
 _MIN_MOTION_SECONDS = 0.02  # shorter motions are mostly noise
 _MIN_SWEEP_SECONDS = 1e-4  # shorter sweeps are instants
 _MAX_SWEEP_SECONDS = 1.0  # from the stamp; points farther away in time have another clock
-_CONVERGENCE, _ITERATIONS = 1e-3, 60  # step, metres and radians, below which registration ends, and limit
+_CONVERGENCE, _ITERATIONS = 1e-3, 60  # step, metres and radians, below which registration ends; most iterations
 _MAX_TURN_RATE = 4.0  # radians per second: registration may spin with its own prediction
 _SLACK, _SLACK_ANGLE = 0.5, np.radians(20.0)  # metres and radians that a registration may move in any case
 _FOUND_GRAVITY = float(np.radians(10.0))  # one sigma before the first frame, whose walls and ground reduce it
