@@ -127,7 +127,7 @@ def _number(value: float | None, form: str) -> float | None:
 
 @dataclass(frozen=True, eq=False)
 class Fix:
-    """The localizer's answer to one frame. Fixes compare by identity.
+    """The localizer's answer to one frame. Equality is identity.
 
     Attributes:
         stamp: of the frame, seconds.
