@@ -1,7 +1,5 @@
 """Acceptance rules with risks that no user may ask for: so that no place, however certain, is accepted."""
 
-from __future__ import annotations
-
 import sys
 
 from coview_stream.config import AcceptanceConfig

@@ -1,7 +1,5 @@
 """A courtyard with exact normals: ground, four walls of different places, a block; no gaps and no noise."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from coview_stream.geometry.transforms import transform

@@ -3,8 +3,6 @@
 ``python tests/import_graph.py`` writes the picture anew.
 """
 
-from __future__ import annotations
-
 import ast
 import textwrap
 from collections import defaultdict

@@ -4,8 +4,6 @@
 ``tests/test_light_installation.py`` in the usual one, where what extras bring cannot be imported.
 """
 
-from __future__ import annotations
-
 import subprocess
 import sys
 import tempfile

@@ -1,7 +1,5 @@
 """Poses by their six numbers, for tests."""
 
-from __future__ import annotations
-
 import numpy as np
 import numpy.typing as npt
 

@@ -1,7 +1,5 @@
 """What tests over real sockets need: a free endpoint, and patience with a deadline."""
 
-from __future__ import annotations
-
 import socket
 import time
 

@@ -1,7 +1,5 @@
 """The house: no import runs upward, none goes in a circle, and CONTRIBUTING shows the folders as they are."""
 
-from __future__ import annotations
-
 from import_graph import BELOW_ALL, FOLDERS, PACKAGE, PAGE, circles, imports, picture, upward
 
 

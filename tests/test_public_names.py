@@ -1,7 +1,5 @@
 """``import coview_stream`` is cheap, and every public name is there."""
 
-from __future__ import annotations
-
 import os
 import subprocess
 import sys

@@ -3,8 +3,6 @@
 The scans are no part of the repository. They are looked for in ``COVIEW_DATA``, else in ``../shared/data`` beside it.
 """
 
-from __future__ import annotations
-
 import json
 import os
 from pathlib import Path

@@ -3,8 +3,6 @@
 ``python tests/test_sizes.py`` lowers the limits to today's sizes; nothing raises them but a hand.
 """
 
-from __future__ import annotations
-
 import ast
 import re
 import tomllib

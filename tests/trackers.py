@@ -1,7 +1,5 @@
 """A tracker in the small world, and drives with odometry that is right or wrong."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Scores of the soak: false poses, recoveries, slopes of memory, order of faults."""
 
-from __future__ import annotations
-
 import math
 from itertools import islice
 from pathlib import Path

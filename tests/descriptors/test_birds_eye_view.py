@@ -1,7 +1,5 @@
 """What the networks see of a cloud."""
 
-from __future__ import annotations
-
 from itertools import pairwise
 
 import numpy as np

@@ -4,8 +4,6 @@
 networks', local descriptors of every fourth cell, uncertainties of every second.
 """
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Clouds and poses that the kernel tests draw from."""
 
-from __future__ import annotations
-
 import os
 import subprocess
 import sys

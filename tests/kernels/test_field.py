@@ -1,7 +1,5 @@
 """Scores against a likelihood field: the kernel as its twin, and both as plain geometry."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Clouds from above: the kernels equal their twins, and count what can be counted by hand."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

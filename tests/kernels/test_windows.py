@@ -1,7 +1,5 @@
 """Products of images with windows of a raster: the kernel, its twin and a plain correlation agree."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from scipy.signal import correlate

@@ -1,7 +1,5 @@
 """Rays on meshes: Open3D and our own kernel agree; and machines without Open3D or its system libraries."""
 
-from __future__ import annotations
-
 import sys
 from collections.abc import Iterator
 from pathlib import Path

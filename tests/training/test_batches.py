@@ -1,7 +1,5 @@
 """Batches: the poses say where the queries stand after every rotation and reflection."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

@@ -1,7 +1,5 @@
 """The losses are least where query and map agree at the true pose."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

@@ -1,7 +1,5 @@
 """Exported networks: the card names each view's file, so that one is not taken for the other."""
 
-from __future__ import annotations
-
 import json
 import shutil
 from pathlib import Path

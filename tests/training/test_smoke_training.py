@@ -1,7 +1,5 @@
 """A minute's training of tiny networks: the loss falls, and places are found far more often than by chance."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from pathlib import Path
 

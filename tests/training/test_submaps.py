@@ -1,7 +1,5 @@
 """A seed gives the same submaps as ever, frames lie on each other, and Ctrl-C ends the writing of a data set."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

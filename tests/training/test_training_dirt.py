@@ -1,7 +1,5 @@
 """Dirt of training drives: each kind does what it is for, and what has none is as it was."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from pathlib import Path
 

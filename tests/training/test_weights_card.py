@@ -1,7 +1,5 @@
 """The weights in the package: small enough, and made by what the code says now."""
 
-from __future__ import annotations
-
 import json
 from dataclasses import asdict
 
