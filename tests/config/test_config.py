@@ -1,6 +1,5 @@
 """Configurations refuse what makes no sense, by name; presets and their options."""
 
-import inspect
 from dataclasses import FrozenInstanceError, asdict, fields, is_dataclass
 
 import numpy as np
@@ -126,10 +125,3 @@ def test_unknown_presets_and_options_are_named():
         map_preset("slam", descriptor=DescriptorConfig())
     with pytest.raises(ConfigError, match=r"MapConfig\.block"):
         map_preset("slam", block=-2.0)
-
-
-@pytest.mark.parametrize("kind", CONFIGS)
-def test_every_field_is_documented(kind):
-    text = inspect.getdoc(kind)
-    missing = [item.name for item in fields(kind) if f"\n    {item.name}: " not in text]
-    assert missing == []

@@ -35,10 +35,6 @@ def test_point_falls_in_its_ring_and_sector(r, ring, degrees, sector):
     assert found[ring, sector] == pytest.approx(3.0, abs=1e-5)
 
 
-def test_points_beyond_radius_are_ignored():
-    assert not describe(polar(20.01, np.arange(0.0, 360, 7), 3.0), np.zeros(3), ALL)["scan_context"].any()
-
-
 def test_bins_hold_max_height_above_centre_and_depressions_are_zero():
     points = np.concatenate(
         [polar(5.0, np.array([40.0, 41.0]), z) for z in (1.0, 4.0)] + [polar(9.0, np.array([40.0]), -2.0)]

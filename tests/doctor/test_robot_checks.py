@@ -179,11 +179,6 @@ def test_same_clock_and_all_frames_paired_is_ok():
     assert "27 of 27" in found["pairing"].found
 
 
-def test_no_cross_checks_without_clouds_or_odometry():
-    assert found_of(capture()) == {}
-    assert found_of(capture(clouds=[(0.0, cloud(0.0))])) == {}
-
-
 @pytest.mark.parametrize(
     ("shifts", "part", "remedy"),
     [

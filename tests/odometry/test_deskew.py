@@ -23,7 +23,8 @@ def turning(t):
 
 
 def segment(motion, times):
-    return Segment(np.array([ns(t) for t in times], np.int64), np.array([motion(t) for t in times]))
+    poses = np.array([motion(t) for t in times]).reshape(-1, 4, 4)
+    return Segment(np.array([ns(t) for t in times], np.int64), poses)
 
 
 def wall(count=800):
@@ -83,9 +84,7 @@ def test_nan_time_means_the_stamp_and_nan_point_affects_no_other():
 @pytest.mark.parametrize(("samples", "end"), [([], 0.1), ([0.0], 0.1), ([0.0, 0.1], 0.0)])
 def test_fewer_than_two_samples_or_points_at_the_stamp_move_nothing(samples, end):
     points = measured(wall(20), straight, np.zeros(40))
-    around = Segment(
-        np.array([ns(t) for t in samples], np.int64), np.array([straight(t) for t in samples]).reshape(-1, 4, 4)
-    )
+    around = segment(straight, samples)
     same = deskew(points, np.linspace(0, end, 40), around, ns(0.0), straight(0.0))
     np.testing.assert_array_equal(same, points)
     assert deskew(points[:0], np.zeros(0), around, ns(0.0), straight(0.0)).shape == (0, 3)
