@@ -1,25 +1,19 @@
 """A robot that sends what a test says, as received by the doctor on a fake clock."""
 
+import fake_robot
 import numpy as np
+from fake_robot import KEYS, ns
 
 from coview_stream.doctor.capture import RobotCapture, capture_cloud, capture_odometry
 from coview_stream.geometry.transforms import pose_from, rot_z
-from coview_stream.messages import encode_cloud, encode_odometry
-from coview_stream.messages.types import CloudMessage, OdometryMessage, Sample
-from coview_stream.stream.transport.keys import robot_keys
+from coview_stream.messages import encode_odometry
+from coview_stream.messages.types import OdometryMessage, Sample
 
-KEYS = robot_keys("native", "coview", "r1")
-EPOCH_NS = 1_700_000_000_000_000_000
 SWEEP = np.random.default_rng(1).uniform(-20.0, 20.0, (2000, 3)).astype(np.float32)
 
 
-def ns(seconds):
-    return EPOCH_NS + round(seconds * 1e9)
-
-
 def cloud(seconds, points=SWEEP, codec="cdr", **fields):
-    encoded = encode_cloud(CloudMessage(ns(seconds), points, **fields), codec)
-    return Sample(KEYS.cloud, encoded.payload, encoded.encoding, encoded.attachment)
+    return fake_robot.cloud(seconds, points, codec, **fields)
 
 
 def odometry(seconds, T=None, codec="json"):
