@@ -7,7 +7,6 @@ from hypothesis import strategies as st
 from kernel_cases import clouds, parallel_parts
 
 from coview_kernels import polar_bin, reference, station_bins
-from coview_kernels.reference.polar import polar_index
 
 SIZES = st.sampled_from([(1, 1), (1, 2), (3, 4), (20, 60), (20, 61), (7, 360)])
 
@@ -94,14 +93,6 @@ def test_kernel_and_numpy_agree_on_sector_edges(sectors):
     grid, _ = polar_bin(points, (0, 0, 0), 20, sectors, 50.0)
     assert_same(grid, reference.polar_bin(points, np.zeros(3), 20, sectors, 50.0)[0])
     assert grid.count.sum() == len(points)
-
-
-@given(st.integers(0, 2**32 - 1))
-def test_polar_index_rotates_with_the_cloud(seed):
-    offset = np.random.default_rng(seed).uniform(-40, 40, (100, 2)).astype(np.float32)
-    here = polar_index(offset[:, 0], offset[:, 1], 20, 60, 60.0)
-    turned = polar_index(-offset[:, 1], offset[:, 0], 20, 60, 60.0)
-    np.testing.assert_array_equal(turned, here // 60 * 60 + (here % 60 + 15) % 60)
 
 
 @st.composite
