@@ -4,12 +4,12 @@ import json
 import math
 import re
 import sys
-import time
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from types import SimpleNamespace
 
 import pytest
+from sockets import until
 
 from bench import __main__ as bench
 from bench import results
@@ -201,8 +201,7 @@ def test_processes_end_with_an_interrupted_release_and_none_begins_after_it(tmp_
     deaf = f"import signal, time; signal.signal(15, signal.SIG_IGN); open({str(begun)!r}, 'w'); time.sleep(60)"
     with ThreadPoolExecutor(1) as pool:
         running = pool.submit(children.run, [sys.executable, "-c", deaf], None)
-        while not begun.exists():
-            time.sleep(0.01)
+        until(begun.exists)
         children.end(0.1)
         assert running.result(timeout=30) is None
     assert children.run([sys.executable, "-c", "pass"], None) is None

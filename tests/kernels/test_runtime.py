@@ -11,6 +11,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from kernel_cases import ROOT, run_python
+from sockets import until
 
 import coview_kernels
 from coview_kernels import backend, polar_bin, reference, runtime, shutdown, submit, warm_up
@@ -272,9 +273,7 @@ def test_process_that_will_be_killed_has_its_kernels_stored_by_another_one_once(
     for stored in (True, False):  # the second process has none compiled again
         done = run_python(code, **{"COVIEW_KERNELS": name, variable: str(tmp_path)})
         assert (abs(done.returncode), done.stderr) == (9, "")
-        end = time.monotonic() + 120.0
-        while not list(tmp_path.rglob("stored-*")) and time.monotonic() < end:
-            time.sleep(0.1)
+        until(lambda: list(tmp_path.rglob("stored-*")), 120.0)
         kernels = [*tmp_path.rglob("*.qdc"), *tmp_path.rglob("*.tic")]
         assert bool(kernels) == stored
         for kernel in kernels:
