@@ -4,10 +4,12 @@ import json
 
 import numpy as np
 import pytest
+from trackers import follow
 
 from coview_stream.errors import InputError
 from coview_stream.geometry.transforms import pose_from
 from coview_stream.localization.calibration.calibration import Calibration
+from coview_stream.localization.localizer import Localizer
 from coview_stream.localization.result import Fix
 from coview_stream.localization.saved_state import SavedState
 from coview_stream.localization.state import State
@@ -92,15 +94,10 @@ def test_other_file_is_refused_by_name(tmp_path, change, text):
 
 @pytest.mark.slow
 def test_localizer_goes_on_where_it_was(world_map, world_drive, tmp_path):
-    from coview_stream.localization.localizer import Localizer
-
-    frames = list(zip(world_drive.clouds, world_drive.T_odom_body, strict=True))
-    first = Localizer(world_map)
-    fixes = [first.step(cloud, T, 0.5 * k) for k, (cloud, T) in enumerate(frames)]
-    assert fixes[-1].T_map_body is not None
+    first, again = Localizer(world_map), Localizer(world_map)
+    known = follow(first, world_drive)[-1]
+    assert known.T_map_body is not None
     first.save_state(tmp_path / "r1.json")
-    again = Localizer(world_map)
     assert again.load_state(tmp_path / "r1.json")
-    fix = again.step(*frames[-1], 0.5 * len(frames))
-    assert fix.T_map_body is not None
-    np.testing.assert_allclose(fix.position, fixes[-1].position, atol=0.1)
+    (fix,) = follow(again, world_drive, [len(world_drive.clouds) - 1], 0.5)
+    np.testing.assert_allclose(fix.position, known.position, atol=0.1)
