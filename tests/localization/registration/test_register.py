@@ -163,9 +163,6 @@ def test_local_map_without_points_is_none_and_is_cut_once(world_map, monkeypatch
     assert len(cuts) == 2
 
 
-FLOOR = SIGMA_FLOOR
-
-
 def test_swap_rotation_translation_reorders_the_same_covariance():
     C = np.arange(36.0).reshape(6, 6)
     np.testing.assert_array_equal(swap_rotation_translation(swap_rotation_translation(C)), C)
@@ -209,7 +206,7 @@ def widened(sigma):
 def test_well_observed_directions_are_inflated_and_floored():
     sigma = np.array([2e-4, 2e-4, 2e-4, 0.002, 0.002, 0.002])
     result = registration_covariance(information_of(sigma), CONFIG)
-    np.testing.assert_allclose(result, np.diag(sigma**2 + FLOOR**2), rtol=5e-3)
+    np.testing.assert_allclose(result, np.diag(sigma**2 + SIGMA_FLOOR**2), rtol=5e-3)
 
 
 def test_weak_direction_is_widened_alone():
@@ -233,7 +230,7 @@ def test_angle_is_weak_by_displacement_at_the_lever_arm():
     lever = WEAK_LEVER
     assert result[2] == pytest.approx(widened(sigma[2] * lever) / lever, rel=0.01)
     assert result[2] > 1.5 * sigma[2]
-    assert result[0] == pytest.approx(np.hypot(sigma[0], FLOOR[0]), rel=0.05)
+    assert result[0] == pytest.approx(np.hypot(sigma[0], SIGMA_FLOOR[0]), rel=0.05)
 
 
 @pytest.mark.parametrize("weakest", [0.0, -1e-3, 1e-9])
@@ -291,7 +288,7 @@ def test_unobserved_directions_stay_unobserved_after_remove_prior():
     fused = register(noisy_scan, mean, target, CONFIG, (0.4,), prior, np.zeros(3))
     T_found, information = remove_prior(fused, prior, CONFIG)
     sigma = np.sqrt(np.diag(registration_covariance(information, CONFIG)))
-    assert (sigma[[0, 1, 5]] < 2 * FLOOR[[0, 1, 5]]).all()
+    assert (sigma[[0, 1, 5]] < 2 * SIGMA_FLOOR[[0, 1, 5]]).all()
     assert (sigma[3:5] > 9.0).all()
     assert sigma[2] > 0.9 * WEAK_SIGMA / WEAK_LEVER
     gap = boxminus(T_found, mean)
