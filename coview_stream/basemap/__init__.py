@@ -1,1 +1,1 @@
-"""Base maps: ground, stations, virtual reference scans, the file."""
+"""Base maps: ground, stations, virtual reference scans, and the map file."""

@@ -39,24 +39,24 @@ _REQUIRED = ("origin", "stations", "points", "normals", "tile_index", "surveyed"
 class BaseMap:
     """Base map, built from clouds or loaded from a ``.coview`` file.
 
-    All coordinates inside are float32 metres relative to :attr:`origin`, (3,) float64 in the frame of the source.
+    All coordinates are float32 metres relative to :attr:`origin`.
 
     Attributes:
         config: settings of the build.
         descriptor_config: settings of the descriptors; queries need the same.
-        origin: (3,) float64, the source-frame position of the map's zero.
+        origin: (3,) float64 metres, the map's zero in the frame of the source.
         crs: coordinate reference system of the source as text, None if unknown.
         sources: sha256 of the source files by name.
         parameters: plain data of the file.
         arrays: arrays by name, as in the file; read-only.
         points: (N, 3) voxel cloud sorted by tile, relative to ``origin``; memory-mapped when loaded.
         stations: (M, 3) ground positions, relative to ``origin``.
-        survey: cells with points on or next to them, above zero; relative to ``origin``.
-        nbytes: bytes of all arrays that :meth:`save` writes: the size of one file, but for a few kB.
+        survey: raster relative to ``origin``, above zero in cells that hold points or touch one that does.
+        nbytes: bytes of all arrays that :meth:`save` writes: the size of the file, except for a few kB.
         sha256: hash of parameters and content; empty until saved or loaded.
         path: file that the map was loaded from, else None.
-        identity: of that file.
-        shared: whether other processes use the map, too: the layers of its field are in the cache then, for all.
+        identity: state of that file.
+        shared: whether other processes use the map too; the cache then holds the layers of its field for all of them.
     """
 
     path: Path | None = None
@@ -73,7 +73,7 @@ class BaseMap:
             self.sources: dict[str, str] = dict(parameters["sources"])
             if not isinstance(self.crs, str | None):
                 raise TypeError("crs is no text")
-            json.dumps(parameters, ensure_ascii=False).encode()  # no half of a surrogate pair: can be printed
+            json.dumps(parameters, ensure_ascii=False).encode()  # refuse lone surrogates: they cannot be printed
         except (KeyError, TypeError, ValueError, AttributeError, OverflowError) as error:
             raise MapError(f"the map's parameters cannot be read ({error}); build it again") from error
         self.arrays, self.parameters, self.sha256 = arrays, parameters, sha256
@@ -102,13 +102,13 @@ class BaseMap:
                 float64 where they are large (UTM).
             preset: ``slam`` (radius 50 m) or ``tls`` (100 m).
             config: replaces preset and options.
-            progress: show a bar on stderr, or a line for each stage where that is no terminal.
+            progress: show a bar on stderr, or one line per stage where stderr is no terminal.
             crs: reference system of arrays, and of files that state none: ``EPSG:code`` or WKT; or "feet",
                 "us-feet". Feet are converted to metres.
             options: fields of :class:`MapConfig` or :class:`DescriptorConfig`.
 
         Raises:
-            CloudError: a source cannot be read, or its system is not of metres.
+            CloudError: a source cannot be read, or its reference system is not in metres.
             ConfigError: an option is unknown or out of range.
             MapError: there is no ground to stand on.
             InputError: ``learned=True`` without weights.
@@ -123,7 +123,7 @@ class BaseMap:
         with naming_missing_libraries("building a map", "build"):
             arrays, parameters = build_arrays(sources_of(sources, crs), settings, progress)
         parameters["config"] = asdict(settings)
-        # as :meth:`load` will read it: a tuple becomes a list
+        # the form that :meth:`load` will read: a tuple becomes a list
         return cls(arrays, json.loads(json.dumps(parameters)))
 
     @classmethod
@@ -133,19 +133,19 @@ class BaseMap:
         check: bool = True,
         verify_key: str | os.PathLike[str] | VerifyKey | Trust | None = None,
     ) -> BaseMap:
-        """Memory-map a ``.coview`` file, or a site's.
+        """Memory-map a ``.coview`` file, or the working file of a site.
 
         Args:
-            path: the file; or the directory of a site, or a part of one, whose working file is written first if it does
+            path: the file, or the directory of a site or of a part of one; its working file is written first if it does
                 not exist.
-            check: compare the content with its checksum, for which the whole file is read (a site's working file only
-                the first time). Without, :attr:`sha256` is taken from the file, for one that was just checked.
-            verify_key: public key, or its PEM file, that must have signed the map; the content is compared with the
-                signed hashes then, unless :class:`~coview_stream.basemap.signature.Trust` says that it has been.
+            check: read the whole file (a site's working file only the first time) and compare it with its checksum.
+                False trusts the file's own :attr:`sha256`, for a file that was just checked.
+            verify_key: public key, or its PEM file, that must have signed the map. The content is then compared with
+                the signed hashes, unless :class:`~coview_stream.basemap.signature.Trust` says that this has been done.
 
         Raises:
-            MapError: it is missing, damaged or of another version, an array has another type or shape, or it is not
-                signed with the key. InputError: the key cannot be read. DependencyError: no ``cryptography``.
+            MapError: the map is missing, damaged, of another version or not signed with the key, or an array has a
+                wrong type or shape. InputError: the key cannot be read. DependencyError: no ``cryptography``.
         """
         if isinstance(verify_key, str | os.PathLike):
             verify_key = read_verify_key(verify_key)
@@ -182,21 +182,21 @@ class BaseMap:
         return f"BaseMap({name}{content}, crs {short_name(self.crs)}, sha256 {self.sha256[:8] or 'none yet'})"
 
     def __reduce__(self) -> tuple[Any, ...]:
-        """Pickle a loaded map as the path of its file, which must be the same when it is read; others as arrays."""
+        """Pickle a loaded map as the path of its file, which must not change until unpickling; others as arrays."""
         if self.path is None:
             return type(self), (self.arrays, self.parameters, self.sha256)
         return _load_again, (type(self), str(self.path), self.sha256, self.identity)
 
     @cached_property
     def summary(self) -> MapSummary:
-        """Extent, area, density, heights, and warnings of features that will make robots fail; printed as one line."""
+        """Extent, area, density, heights, and warnings of features on which robots will fail; printed as one line."""
         from coview_stream.basemap.summary import summary
 
         return summary(self)
 
     @cached_property
     def bounds(self) -> Floats:
-        """(2, 3) float64 lowest and highest coordinates of the points, in the frame of the sources, metres."""
+        """Lowest and highest coordinates (2, 3) float64 of the points, in the frame of the sources, metres."""
         return np.array([self.points.min(axis=0), self.points.max(axis=0)], dtype=np.float64) + self.origin
 
     def world_points(self) -> Floats:
@@ -206,8 +206,8 @@ class BaseMap:
     def plot(self, axes: Any = None) -> Any:
         """Draw the map from above, in the frame of the sources, metres, so that poses can be drawn over it.
 
-        ``axes`` of matplotlib are drawn into; None makes a figure (``matplotlib.pyplot.show()`` shows it). Returns the
-        axes; DependencyError if matplotlib is missing.
+        Draws into the matplotlib ``axes`` and returns them; None makes a figure (``matplotlib.pyplot.show()`` shows
+        it). DependencyError if matplotlib is missing.
         """
         from coview_stream.basemap.summary import draw_plan
 
@@ -215,12 +215,12 @@ class BaseMap:
 
     @cached_property
     def station_grid(self) -> StationGrid:
-        """Look-up of stations by position."""
+        """Grid that finds stations by position."""
         return StationGrid(self.stations, self.config.block)
 
     @cached_property
     def station_index(self) -> StationIndex:
-        """Index of the descriptors, from the file; making one takes a second for 10,000 stations.
+        """Index of the descriptors, from the file, else built here (a second for 10,000 stations).
 
         MapError if the file's index has another number of stations.
         """
@@ -231,13 +231,13 @@ class BaseMap:
         return index or StationIndex.of({name: self.descriptors(name) for name in channels})
 
     def sampled_points(self, count: int) -> Points:
-        """Return at most ``count`` of :attr:`points`, evenly spread over them; a copy."""
+        """Return a copy of at most ``count`` of :attr:`points`, evenly spaced by number."""
         return np.array(self.points[:: max(1, -(-len(self.points) // count))])
 
     def descriptors(self, name: Channel) -> npt.NDArray[np.float16]:
-        """Return the descriptors (M, R, S) of one channel, which the search does not need.
+        """Return the descriptors (M, R, S) of one channel. The search does not need them.
 
-        Maps without them make them from the cloud, once: 2 s and 24 MB for 10,000 stations on two cores.
+        A map without descriptors computes them once from its cloud: 2 s and 24 MB for 10,000 stations on two cores.
         """
         stored = self.arrays.get(f"descriptor.{name}")
         if stored is not None:
@@ -270,7 +270,7 @@ class BaseMap:
 
     @cached_property
     def field(self) -> kernels.FieldMap:
-        """Likelihood field, relative to :attr:`origin`; made here if the file has none. MapError if it is invalid."""
+        """Likelihood field, relative to :attr:`origin`; built here if the file has none. MapError if it is invalid."""
         if self.shared:
             from coview_stream.basemap.site.working_file import with_shared_layers
 
@@ -283,14 +283,14 @@ class BaseMap:
         try:
             field = field_of(arrays)
             _ = field.layers
-            for array in (field.tiles, field.occupied, field.ground, field.edge):  # only the layers are looked up
+            for array in (field.tiles, field.occupied, field.ground, field.edge):  # scores read only the layers
                 release(array)
             return field
         except (KeyError, ValueError) as error:
             raise MapError(f"the map's likelihood field cannot be used ({error}); build it again") from error
 
     def surveyed(self, xy: Reals) -> Bools:
-        """Return (K,) whether the map has points around positions (K, 2), relative to :attr:`origin`."""
+        """Mask (K,) the positions (K, 2), relative to :attr:`origin`, around which the map has points."""
         grid = self.arrays["surveyed"]
         index = np.floor((xy - self.survey.corner) / self.config.block).astype(np.int64)
         inside = ((index >= 0) & (index < np.array(grid.shape)[::-1])).all(axis=1)
@@ -302,10 +302,10 @@ class BaseMap:
 
         Args:
             reloc: mode of the search.
-            load: also load the network; only searching needs it.
+            load: also load the network, which only a search needs.
 
         Returns:
-            The reason, with the remedy, why ``auto`` does not use the map's features; else None.
+            Why ``auto`` does not use the map's features, and the remedy; None if it uses them.
 
         Raises:
             MapError, InputError: with ``learned``, if features or weights are missing, do not fit together or cannot
@@ -333,7 +333,7 @@ class BaseMap:
 
 
 def station_descriptors(base_map: BaseMap, station: int) -> dict[Channel, npt.NDArray[np.float16]]:
-    """Return the descriptors (R, S) of one station by channel, made from the cloud around it if the map has none."""
+    """Return a station's descriptors (R, S) by channel, computed from the cloud around it if the map has none."""
     config, block = base_map.config.descriptor, base_map.config.block
     if all(f"descriptor.{name}" in base_map.arrays for name in config.channels):
         return {name: base_map.descriptors(name)[station] for name in config.channels}
@@ -349,7 +349,7 @@ def station_descriptors(base_map: BaseMap, station: int) -> dict[Channel, npt.ND
 
 
 def _load_again(kind: type[BaseMap], path: str, sha256: str, identity: FileIdentity | None) -> BaseMap:
-    """Load a map that was pickled as its path; MapError where its file is gone or another."""
+    """Load a map that was pickled as its path; MapError if its file is missing or has changed."""
     base_map = kind.load(path, check=False)
     if base_map.identity != identity:  # a copy, or another file
         base_map = kind.load(path)
@@ -359,7 +359,7 @@ def _load_again(kind: type[BaseMap], path: str, sha256: str, identity: FileIdent
 
 
 def load_served(files: Mapping[str, Path], sha256: str) -> BaseMap:
-    """Return the map of a hash from its file, which the node has checked; MapError if the file is another one now."""
+    """Load the map with a hash from its file, which the node has checked; MapError if the file has changed since."""
     base_map = BaseMap.load(files[sha256], check=False)
     if base_map.sha256 != sha256:
         raise MapError(f"{files[sha256]}: the file is of another map than the one that is served")

@@ -1,4 +1,4 @@
-"""Building of a map in memory: clouds to arrays with the paper's virtual reference scans."""
+"""Build a map in memory, from clouds to arrays with the paper's virtual reference scans."""
 
 from __future__ import annotations
 
@@ -20,13 +20,13 @@ from coview_stream.clouds.progress import Progress, staged_bar
 from coview_stream.config import MapConfig
 from coview_stream.errors import MapError, warn
 
-_MIN_POINTS = 1000  # fewer are no site
+_MIN_POINTS = 1000  # of a site
 
 _SHARES = {
     "reading": 0.04, "cleaning, finding normals": 0.18, "finding the ground": 0.07, "describing stations": 0.03,
     "computing learned features": 0.53, "computing the likelihood field": 0.15,
 }  # fmt: skip
-"""Of the time of a build, for its bar: as of a street survey of 0.2 km2."""
+"""Shares of the build time for the progress bar, measured on a street survey of 0.2 km2."""
 
 
 def build_arrays(sources: list[Source], config: MapConfig, progress: bool = False) -> tuple[Arrays, dict[str, Any]]:
@@ -35,12 +35,12 @@ def build_arrays(sources: list[Source], config: MapConfig, progress: bool = Fals
     Raises:
         CloudError: a source cannot be read.
         MapError: too few points, or no ground to put stations on.
-        InputError: learned features are asked for, and there are no weights.
+        InputError: learned features are requested without weights.
     """
     if config.learned:
         from coview_stream.descriptors.network import VIEW_NAMES, network
 
-        for view in VIEW_NAMES:  # before the clouds are read: they may be missing
+        for view in VIEW_NAMES:  # fail before reading clouds if weights are missing
             network(view)
     shares = {name: share for name, share in _SHARES.items() if config.learned or name != "computing learned features"}
     with staged_bar(shares, progress) as stage:
@@ -50,7 +50,7 @@ def build_arrays(sources: list[Source], config: MapConfig, progress: bool = Fals
 def _build(sources: list[Source], config: MapConfig, stage: Callable[[str], Progress]) -> tuple[Arrays, dict[str, Any]]:
     paths = [source.path for source in sources]
     names = str(paths[0]) if len(paths) == 1 else f"{paths[0]} and {len(paths) - 1} more"
-    heads = [source.head() for source in sources]  # all heads before the first points
+    heads = [source.head() for source in sources]  # reject a bad head before reading any points
     warning = check_together(heads)
     warn(warning)
     warn_of_other_systems(sources, heads)

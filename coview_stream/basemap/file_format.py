@@ -1,8 +1,8 @@
 """The ``.coview`` file: safetensors, memory-mapped, versioned, checksummed, written atomically.
 
-safetensors is a length, a JSON header and raw little-endian arrays: nothing in it is executed on loading. The header's
+A safetensors file is a length, a JSON header and raw little-endian arrays; loading executes nothing. The header's
 metadata hold the format version, all parameters, and the sha256 of parameters and arrays. In a signed file they also
-hold the sha256 of each array and an ed25519 signature of all the rest of the header, so that every byte is covered.
+hold the sha256 of each array and an ed25519 signature of the rest of the header, so that every byte is covered.
 """
 
 from __future__ import annotations
@@ -75,12 +75,12 @@ _EXPECTED: dict[str, tuple[str, _Shape]] = {
     "learned.place": ("|i1", ("places", "numbers")),
     "learned.place_at": ("<f4", ("places", 2)),
 }
-"""Type and shape of each array; dimensions of the same name have the same length."""
-_MAX_METRES = 1e7  # of a corner, a station or a point: no map of the Earth is larger
-MAX_AREA = 5.4e8  # square metres of the rectangle that holds a map: more than kernels count in int32
+"""Type and shape of each array; dimensions with the same name have the same length."""
+_MAX_METRES = 1e7  # coordinate of a corner, a station or a point: no map of the Earth is larger
+MAX_AREA = 5.4e8  # square metres of a map's bounding rectangle: kernels count its cells in int32
 _FEATURES_TILE = 32.0  # metres
-_BESIDE = 1300.0  # metres: a tile of a site, which the field may cover beside what has been surveyed
-_ROWS = 1 << 18  # points that are checked at a time
+_BESIDE = 1300.0  # metres by which the field may exceed the surveyed cells: the largest tile of a site
+_ROWS = 1 << 18  # points checked at a time
 
 
 class Loaded(NamedTuple):
@@ -88,9 +88,9 @@ class Loaded(NamedTuple):
 
     Attributes:
         arrays: memory-mapped, read-only.
-        parameters: of the build.
-        sha256: of both.
-        identity: of the file.
+        parameters: settings and facts of the build.
+        sha256: hash of arrays and parameters.
+        identity: state of the file.
     """
 
     arrays: Arrays
@@ -100,9 +100,9 @@ class Loaded(NamedTuple):
 
 
 def save(path: Path, arrays: Arrays, parameters: dict[str, Any], key: SigningKey | None = None) -> str:
-    """Write a map, signed if there is a key, and return its sha256; an earlier file stays until it is complete.
+    """Write a map, signed if there is a key, and return its sha256; an earlier file stays until the new is complete.
 
-    MapError as of :func:`check_target`, or if the directory cannot be written.
+    Raises the MapError of :func:`check_target`, or one if the directory cannot be written.
     """
     check_target(path)
     text = json.dumps(parameters, sort_keys=True)
@@ -110,7 +110,7 @@ def save(path: Path, arrays: Arrays, parameters: dict[str, Any], key: SigningKey
     digest = _digest(text, contiguous, lambda name: _chunks(contiguous[name]))
     metadata = {"format": FORMAT, "version": str(VERSION), "parameters": text, "sha256": digest}
     header: dict[str, Any] = {"__metadata__": metadata}
-    # arrays that fill cache lines come first, and begin with one; then by item size: each begins at a multiple of it
+    # arrays of whole cache lines first, so that each begins on a line; the rest by item size, for their alignment
     names = sorted(
         contiguous, key=lambda name: (contiguous[name].nbytes % _CACHE_LINE > 0, -contiguous[name].dtype.itemsize, name)
     )
@@ -122,7 +122,7 @@ def save(path: Path, arrays: Arrays, parameters: dict[str, Any], key: SigningKey
     if key is not None:
         sign_header(header, {name: sha256_of(_chunks(contiguous[name])) for name in sorted(names)}, key)
     try:
-        # array by array: the safetensors library's own writer holds a second copy of everything
+        # array by array: the safetensors library would hold a second copy of everything
         with atomic_file(path, sync=True) as file:
             file.write(_header_bytes(header))
             for name in names:
@@ -137,7 +137,7 @@ def check_target(path: Path) -> None:
     """Refuse to replace anything but a map.
 
     Raises:
-        MapError: the path is a directory, a device, another kind of file, or in a directory that does not exist.
+        MapError: the path is a directory, a device or another kind of file, or its directory does not exist.
     """
     if path.is_dir() or not path.resolve().parent.is_dir():
         raise MapError(f"{path}: not a place for a file; give a name in a directory that exists")
@@ -156,14 +156,14 @@ def check_target(path: Path) -> None:
 
 
 def _header_bytes(header: dict[str, Any]) -> bytes:
-    """Return a header with its length, padded to whole cache lines."""
+    """Serialise a header with its length in front, padded to whole cache lines."""
     text = serialized(header)
     text += b" " * (-(8 + len(text)) % _CACHE_LINE)
     return len(text).to_bytes(8, "little") + text
 
 
 def _is_exact(file: BinaryIO, header: dict[str, Any], start: int) -> bool:
-    """Return whether a file begins with the header as :func:`save` writes it."""
+    """Return whether a file begins with exactly the bytes that :func:`save` writes for this header."""
     try:
         file.seek(0)
         return file.read(start) == _header_bytes(header)
@@ -172,7 +172,7 @@ def _is_exact(file: BinaryIO, header: dict[str, Any], start: int) -> bool:
 
 
 def load(path: Path, check: bool = True) -> tuple[Arrays, dict[str, Any], str]:
-    """Return arrays, parameters and sha256 of :func:`open_file`."""
+    """Memory-map a map with :func:`open_file`, and return arrays, parameters and sha256."""
     return open_file(path, check)[:3]
 
 
@@ -185,16 +185,15 @@ def open_file(
 ) -> Loaded:
     """Memory-map a map, signed or not.
 
-    With ``check`` the whole file is read once, to compare it with its checksum; after that only used pages are in
-    memory. All is read from the file that was opened, even if another file takes its name.
+    Everything is read from the file that was opened, even if another file takes its name.
 
     Args:
         path: the file.
-        check: compare the content with its checksum. A file that must be signed is always compared with its signed
-            hashes, unless ``trust`` states that this has been done.
+        check: read the whole file once to compare it with its checksum; afterwards only used pages stay in memory. A
+            file that must be signed is always compared with its signed hashes, unless ``trust`` says it has been.
         trust: requires a signature.
-        checked: identity of a file whose content has been compared with its checksum; if equal, it is not read again.
-        opened: called with the file before it is read.
+        checked: identity of a file that has been compared with its checksum already; the same file is not read again.
+        opened: called with the open file before it is read.
 
     Raises:
         MapError: missing, not a base map, of another version, truncated, damaged, changed meanwhile, or not signed
@@ -221,7 +220,7 @@ def open_file(
             arrays = {name: _mapped(file, identity.size, start, header[name]) for name in names}
             used = start + sum(array.nbytes for array in arrays.values())
             if used > identity.size:
-                raise ValueError("its arrays overlap")  # or reading them takes any time
+                raise ValueError("its arrays overlap")  # overlapping arrays could take forever to read
             if trust is not None and used < identity.size:
                 raise ValueError("it holds bytes that belong to no array and are not signed")
             digest = str(metadata.get("sha256"))
@@ -242,7 +241,7 @@ def open_file(
 
 
 def signer(path: Path) -> str | None:
-    """Return the unverified fingerprint of the key that signed a map, None if none did; MapError if it is no map."""
+    """Return the unverified fingerprint of a map's signing key, None if unsigned; MapError if the file is no map."""
     with _opened(path) as file:
         metadata = _header(path, file)[0].get("__metadata__", {})
     return str(metadata.get("signer")) if "signature" in metadata else None
@@ -268,7 +267,7 @@ def _header(path: Path, file: BinaryIO) -> tuple[dict[str, Any], int]:
         if isinstance(error, MapError):
             raise
         raise MapError(f"{path}: not a coview map, or its header is damaged; build it again") from error
-    # padded by blanks only: JSON would also accept a blank damaged into a line end
+    # only blanks may pad the header: JSON would also accept a line end, which is a damaged blank
     padded = text.rstrip(b" ").endswith(b"}")
     if not (padded and isinstance(header, dict) and isinstance(header.get("__metadata__", {}), dict)):
         raise MapError(f"{path}: not a coview map, or its header is damaged; build it again")
@@ -289,7 +288,7 @@ def _mapped(file: BinaryIO, size: int, start: int, entry: dict[str, Any]) -> npt
 
 
 def _read(file: BinaryIO, start: int, entry: dict[str, Any]) -> Iterator[bytes]:
-    """Read an array's bytes in chunks: pages of a memory map would count as this process's memory."""
+    """Yield an array's bytes in chunks, by reads: pages of a memory map would count as this process's memory."""
     begin, end = entry["data_offsets"]
     file.seek(start + begin)
     while begin < end:
@@ -309,7 +308,7 @@ def _chunks(array: npt.NDArray[Any]) -> Iterator[memoryview]:
 
 
 def release_arrays(arrays: Arrays) -> None:
-    """Release the memory of arrays that are mapped from a file."""
+    """Release the pages of arrays that are mapped from a file."""
     for array in arrays.values():
         release(array)
 
@@ -325,10 +324,10 @@ def _digest(parameters: str, arrays: Arrays, content: Callable[[str], Iterator[b
 
 
 def check_arrays(arrays: Mapping[str, npt.NDArray[Any]], config: MapConfig, points: bool = True) -> None:
-    """Check types and shapes of a map's arrays, and values that are used as indices; MapError names a wrong one.
+    """Check types and shapes of a map's arrays, and the values used as indices; MapError names the wrong array.
 
-    Stations, field and ``points``, if they are asked for, must lie on the raster of surveyed cells: all other rasters
-    are as large as it at most, and it is in the file.
+    Stations, field and, with ``points``, the points must lie on the raster of surveyed cells. That raster is in the
+    file, so it bounds the size of all other rasters.
     """
     bins, channels = (config.descriptor.rings, config.descriptor.sectors), len(config.descriptor.channels)
     descriptor = ("<f2", ("stations", *bins))
@@ -341,7 +340,7 @@ def check_arrays(arrays: Mapping[str, npt.NDArray[Any]], config: MapConfig, poin
     for name, (kind, dimensions) in expected.items():
         array = arrays.get(name)
         if array is None:
-            continue  # BaseMap requires the arrays that must exist
+            continue  # BaseMap checks for missing arrays
         if array.dtype != np.dtype(kind) or array.ndim != len(dimensions):
             raise _refused(
                 name, f"is {array.dtype} {array.shape}, not {np.dtype(kind)} in {len(dimensions)} dimensions"
@@ -361,7 +360,7 @@ def check_arrays(arrays: Mapping[str, npt.NDArray[Any]], config: MapConfig, poin
     low, high = corner - config.block, corner + size + config.block
     for name in ("stations", "points") if points else ("stations",):
         _check_places(name, arrays[name], low, high)
-    # tiles of the field are (row, column), all else (x, y)
+    # tiles of the field are (row, column), all others (x, y)
     for name, unit, xy in (
         ("field.tiles", FIELD_CELL * FIELD_TILE, [1, 0]),
         ("learned.tiles", _FEATURES_TILE, [0, 1]),
@@ -373,7 +372,7 @@ def check_arrays(arrays: Mapping[str, npt.NDArray[Any]], config: MapConfig, poin
             )
             if not ((first >= low - _BESIDE) & (last <= high + _BESIDE)).all():  # false for NaN as well
                 raise _refused(name, "lies beside the surveyed cells")
-    # of each stretch of points once: nothing that is cut out of the map is larger than the map
+    # each stretch of points once, so that no crop is larger than the map
     stretches = arrays["tile_index"][:, 2:]
     begin, end = stretches[np.lexsort(stretches.T)].T if len(stretches) else stretches.T
     if len(arrays["points"]) > MAX_POINTS:
@@ -389,7 +388,7 @@ def _check_places(name: str, places: npt.NDArray[Any], low: npt.NDArray[Any], hi
         part = places[start : start + _ROWS]
         bottom, top = part.min(axis=0).astype(np.float64), part.max(axis=0).astype(np.float64)
         release(places)
-        if not (np.abs([bottom, top]) < _MAX_METRES).all():  # NaN comes through min and max
+        if not (np.abs([bottom, top]) < _MAX_METRES).all():  # min and max propagate NaN
             raise _refused(name, f"is not finite, or beyond {_MAX_METRES:g} m")
         if not ((bottom[:2] >= low) & (top[:2] <= high)).all():
             raise _refused(name, "lies beside the surveyed cells")

@@ -1,4 +1,4 @@
-"""Ground of a base map: its points and heights, by cloth simulation (as in the paper) or a morphological filter."""
+"""Ground points and heights of a base map, by cloth simulation (as in the paper) or a morphological filter."""
 
 from __future__ import annotations
 
@@ -21,36 +21,36 @@ from coview_stream.geometry.rasters import cells, filled, lowest_per_cell
 from coview_stream.geometry.transforms import Points
 
 Method = Literal["auto", "cloth", "morphological"]
-"""``auto`` takes the cloth where its wheel is installed and the points are wide enough for a cloth to hang."""
+"""``auto`` uses the cloth if its wheel is installed and the points are wide enough for a cloth to hang."""
 
 # ``python -m bench ground`` scores all these on labelled scans
 _CELL = 0.5  # metres: a filter gets the lowest point of each cell
-_MAX_CELLS = 20_000_000  # above, cells grow: bounds time and memory
-_CLASS_THRESHOLD = 0.3  # metres above or below the ground's raster that are ground
-_SLOPE_ALLOWANCE = 0.3  # metres more for each unit of local slope
-_REFINEMENTS = 4  # rounds in which lowest points near the raster join the ground that made it
+_MAX_CELLS = 20_000_000  # larger areas get larger cells, which bounds time and memory
+_CLASS_THRESHOLD = 0.3  # metres from the ground raster within which a point is ground
+_SLOPE_ALLOWANCE = 0.3  # metres added to it per unit of local slope
+_REFINEMENTS = 4  # rounds in which lowest points near the ground raster are added to it
 _PORTION = 1_000_000  # points classified at a time
 _MIN_CELLS = 50  # with fewer occupied cells all lowest points are ground: a cloth cannot rest on them
-# of the cloth
+# cloth
 _NODES = 1.0  # metres between its nodes
 _RIGIDNESS = 2  # 1 for mountains, 2 for relief, 3 for plains
-_ITERATIONS = 100  # at most, until it rests: in steep forest 50 are too few, 200 no better
-_CLOTH_THRESHOLD = 0.5  # metres from the cloth to a lowest point that is ground
-_TILE, _MARGIN = 256.0, 24.0  # metres: smaller cloths rest sooner and fit the cache; 1.5 km2 as one took 75 s
+_ITERATIONS = 100  # limit until the cloth rests: in steep forest 50 are too few, 200 no better
+_CLOTH_THRESHOLD = 0.5  # metres from the cloth within which a lowest point is ground
+_TILE, _MARGIN = 256.0, 24.0  # metres: smaller cloths rest sooner and fit the cache; one of 1.5 km2 took 75 s
 _MIN_POINTS = 10  # for a cloth to rest on
-# of the morphological filter
-_MAX_WINDOW = 40.0  # metres: wider roofs are taken for ground, larger hills survive whole
+# morphological filter
+_MAX_WINDOW = 40.0  # metres: wider roofs pass for ground, larger hills survive whole
 _MAX_SLOPE = 0.3  # of terrain between two windows
 _FIRST_THRESHOLD = 0.5  # metres above the surface opened by the first window
 
 
 def cloth_available() -> bool:
-    """Return whether the wheel is installed; there is none for Python 3.13 and for ARM."""
+    """Return whether the cloth's wheel is installed; there is none for Python 3.13 or for ARM."""
     return importlib.util.find_spec("CSF") is not None
 
 
 def _cloth_ground(points: Points) -> Bools:
-    """Mask the points (N, 3), metres, on which the cloth comes to lie, dropped on the upturned cloud."""
+    """Mask the points (N, 3), metres, on which a cloth comes to rest when dropped on the inverted cloud."""
     ground = np.zeros(len(points), dtype=bool)
     low = points[:, :2].min(axis=0).astype(np.float64)
     counts = np.maximum(1, np.ceil(np.ptp(points[:, :2], axis=0) / _TILE)).astype(int)
@@ -91,10 +91,10 @@ def _one_cloth(points: Points) -> Bools:
 
 @functools.cache
 def _one_thread() -> None:
-    """Run the cloth in one thread: its many short parallel loops busy-wait, three times slower on busy cores."""
+    """Run the cloth in one thread: its short parallel loops busy-wait, and take three times as long on busy cores."""
     library = importlib.import_module("_CSF").__file__
     try:
-        # its private OpenMP is among its dependencies, where a symbol lookup by handle finds it
+        # a symbol lookup by handle also searches the library's dependencies, where its private OpenMP is
         ctypes.CDLL(library).omp_set_num_threads(1)
     except (OSError, AttributeError):
         return  # built without OpenMP
@@ -102,7 +102,7 @@ def _one_thread() -> None:
 
 @contextmanager
 def _silence() -> Iterator[None]:
-    """Discard the standard output of the C library: the wheel reports every step there."""
+    """Discard the C library's standard output, where the wheel reports every step."""
     libc = ctypes.CDLL(None) if os.name == "posix" else None
     sys.stdout.flush()
     try:
@@ -116,7 +116,7 @@ def _silence() -> Iterator[None]:
         yield
     finally:
         if libc is not None:
-            libc.fflush(None)  # before the descriptor comes back, or its buffer is written to the real output
+            libc.fflush(None)  # before the descriptor is restored, or the buffer goes to the real output
         os.dup2(saved, 1)
         os.close(null)
         os.close(saved)
@@ -128,8 +128,7 @@ class GroundRaster:
 
     Attributes:
         z: (H, W) float32, row along y and column along x; NaN where the ground is unknown.
-        x0: x of the lower corner of cell (0, 0).
-        y0: y of the lower corner of cell (0, 0).
+        x0, y0: lower corner of cell (0, 0).
         cell: edge length.
     """
 
@@ -141,7 +140,7 @@ class GroundRaster:
     def height_at(self, xy: Reals) -> Floats32:
         """Interpolate the ground height (N,) at (N, 2) positions; NaN in unknown cells and outside.
 
-        Bilinear between cell centres; unknown neighbours carry no weight.
+        The interpolation is bilinear between the centres of known cells.
         """
         height, width = self.z.shape
         column = (xy[:, 0].astype(np.float64) - self.x0) / self.cell
@@ -164,11 +163,7 @@ class GroundRaster:
 
 
 def ground_filter(points: Points, method: Method = "auto") -> Literal["cloth", "morphological"]:
-    """Choose the filter for these (N, 3) points, metres.
-
-    Raises:
-        DependencyError: ``method`` is ``cloth``, and its wheel is not installed.
-    """
+    """Choose the filter for (N, 3) points, metres; DependencyError if ``cloth`` is asked for and not installed."""
     if method == "cloth" and not cloth_available():
         raise DependencyError(
             "the ground filter `cloth` needs the wheel cloth-simulation-filter, which exists for x86-64 and Python up "
@@ -183,15 +178,15 @@ def ground_filter(points: Points, method: Method = "auto") -> Literal["cloth", "
 def ground_mask(points: Points, method: Method = "auto") -> Bools:
     """Mask (N,) the points that lie on the ground.
 
-    The lowest point of each cell goes through the filter; then all points are classified by their height above the
-    raster of the lowest points that were ground.
+    The filter finds the ground among the lowest points of the cells. All points are then classified by their height
+    above the raster of this ground.
 
     Args:
         points: (N, 3) float32 metres, finite, z up.
         method: the filter.
 
     Raises:
-        ConfigError: the extent is absurd for a map. DependencyError: as of :func:`ground_filter`.
+        ConfigError: the extent is absurd for a map. DependencyError: see :func:`ground_filter`.
     """
     if not len(points):
         return np.zeros(0, dtype=bool)
@@ -202,7 +197,7 @@ def ground_mask(points: Points, method: Method = "auto") -> Bools:
     mask = np.zeros(len(points), dtype=bool)
     for start in range(0, len(points), _PORTION):
         part = points[start : start + _PORTION]
-        # float32 may round the outermost point up to the next cell
+        # float32 may round the outermost point up into the next cell
         column = np.minimum(((part[:, 0] - surface.x0) / surface.cell).astype(np.intp), slope.shape[1] - 1)
         row = np.minimum(((part[:, 1] - surface.y0) / surface.cell).astype(np.intp), slope.shape[0] - 1)
         allowed = _CLASS_THRESHOLD + _SLOPE_ALLOWANCE * slope[row, column]
@@ -211,7 +206,7 @@ def ground_mask(points: Points, method: Method = "auto") -> Bools:
 
 
 def _ground_surface(points: Points, method: Method) -> GroundRaster:
-    """Raster the lowest ground of the cloud's extent, interpolated under buildings and trees, without NaN."""
+    """Raster the ground over the cloud's extent, interpolated under buildings and trees, without NaN."""
     chosen, cell = ground_filter(points, method), _CELL
     corner, shape, flat = cells(points, cell)
     while shape[0] * shape[1] > _MAX_CELLS:
@@ -246,14 +241,14 @@ def _stray_low(z: Floats32) -> Bools:
 
 
 def _refined(shape: tuple[int, int], heights: Floats32, occupied: Ints, ground: Bools, cell: float) -> Floats32:
-    """Raster the ground cells; lowest points near its interpolation join them, which restores steep slopes."""
+    """Raster the ground cells, and add lowest points near the interpolated raster, which restores steep slopes."""
     from scipy import ndimage  # not part of the robot's side
 
     for _ in range(_REFINEMENTS + 1):
         raster = np.full(shape, np.nan, dtype=np.float32)
         raster.flat[occupied[ground]] = heights[ground]
         surface = filled(raster)
-        # a little smoothing: single low returns must not pull the surface down, and slopes need a scale
+        # smooth a little: single low returns must not pull the surface down, and slopes need a scale
         smooth = ndimage.gaussian_filter(surface, 1.0 / cell, mode="nearest")
         away = np.abs(heights - smooth.flat[occupied])
         slope = _gradient(smooth, cell).flat[occupied]
@@ -275,7 +270,7 @@ def _gradient(z: Floats32, cell: float) -> Floats32:
 def _morphological_ground(z: Floats32, cell: float) -> Bools:
     """Mask the ground cells of a raster of lowest heights (H, W; NaN where empty; metres): a progressive filter.
 
-    Openings with growing windows remove objects that are narrower than the window and stand out of the opened surface
+    Openings with growing windows remove objects that are narrower than the window and rise above the opened surface
     by more than a slope of 0.3 explains.
     """
     from scipy import ndimage  # not part of the robot's side
@@ -285,7 +280,7 @@ def _morphological_ground(z: Floats32, cell: float) -> Bools:
     window, previous = 1.0, 0.0
     while window <= _MAX_WINDOW:
         size = 2 * max(1, round(window / cell / 2)) + 1
-        # separable: a square window costs two passes of one row
+        # separable: a square window costs two one-dimensional passes
         opened = ndimage.grey_opening(surface, size=(size, size), mode="nearest")
         threshold = min(_FIRST_THRESHOLD + _MAX_SLOPE * (window - previous) / 2, 3.0)
         ground &= ~(surface - opened > threshold)

@@ -1,7 +1,7 @@
-"""Several maps as one: placed next to each other in one frame, so that one search compares places on all of them.
+"""Several maps placed side by side in one frame, so that one search compares places on all of them.
 
-The search does not know of it: places on other maps are rivals like those of the same map, and a robot that fits two
-storeys alike stays without a pose. Between two maps is a gap wider than any scan.
+Places on other maps are rivals like places on the same map, and a robot that fits two storeys alike gets no pose. The
+gap between two maps is wider than any scan.
 """
 
 from __future__ import annotations
@@ -32,16 +32,16 @@ from coview_stream.geometry.arrays import Floats, Ints
 JOINED_SUFFIX = ".joined"
 
 _NAMES_FORMAT = "coview-joined"
-_VERSION = 2  # of the arrays made of the same maps
+_VERSION = 2  # of the arrays that are built from the same maps
 
-_MIN_GAP = 300.0  # metres between two maps at least: a lidar's range, and a margin beyond the map's edge
+_MIN_GAP = 300.0  # metres: a lidar's range, and a margin beyond the map's edge
 _SHARED = ("block", "voxel", "tile", "descriptor")
 
 
 def load_map(path: Path, verify_key: VerifyKey | None = None) -> BaseMap:
     """Load one map (:meth:`BaseMap.load`), or several as one, from a file of :func:`write_names`.
 
-    Each must be signed with the key, if there is one. MapError if they cannot be joined.
+    With a key, each map must be signed. MapError if the maps cannot be joined.
     """
     if path.suffix != JOINED_SUFFIX:
         return BaseMap.load(path, verify_key=verify_key)
@@ -51,7 +51,7 @@ def load_map(path: Path, verify_key: VerifyKey | None = None) -> BaseMap:
 
 
 def write_names(maps: Sequence[tuple[str, Path]]) -> Path:
-    """Write names and paths of maps into a small file that :func:`load_map` takes, and return its path.
+    """Write names and paths of maps into a small file for :func:`load_map`, and return its path.
 
     MapError if two have the same name, or the cache cannot be written.
     """
@@ -65,7 +65,7 @@ def write_names(maps: Sequence[tuple[str, Path]]) -> Path:
 
 
 def read_names(file: Path) -> list[tuple[str, Path]]:
-    """Return the names and paths in a file of :func:`write_names`; MapError if it is another file."""
+    """Return the names and paths in a file of :func:`write_names`; MapError if it is no such file."""
     try:
         data = read_record(file)
         if data["format"] != _NAMES_FORMAT:
@@ -76,7 +76,7 @@ def read_names(file: Path) -> list[tuple[str, Path]]:
 
 
 def joined_file(paths: Sequence[tuple[str, Path]], verify_key: VerifyKey | None = None) -> Path:
-    """Return the cached file of several maps as one, and write it if it does not exist; MapError if that fails."""
+    """Return the cached file of several joined maps, written if it does not exist; MapError if that fails."""
     maps = {name: BaseMap.load(path, verify_key=verify_key) for name, path in paths}
     key = repr([(name, base_map.sha256) for name, base_map in maps.items()])
     path = cache_folder() / f"joined-{hashlib.sha256(key.encode()).hexdigest()[:40]}.{_VERSION}.coview"
@@ -90,7 +90,7 @@ def joined_file(paths: Sequence[tuple[str, Path]], verify_key: VerifyKey | None 
 
 
 def join_maps(maps: Mapping[str, BaseMap]) -> BaseMap:
-    """Join several maps, placed from west to east; MapError if there are none, or settings differ."""
+    """Join several maps, placed from west to east; MapError if there are none or their settings differ."""
     if not maps:
         raise MapError("no maps to join: name two or more")
     (first_name, first), *others = maps.items()
@@ -164,9 +164,9 @@ def _surveyed(pairs: Sequence[tuple[BaseMap, Floats]], block: float) -> Arrays:
 
 
 def _placed(maps: Mapping[str, BaseMap]) -> tuple[list[MapPart], list[Floats]]:
-    """Return the parts of the joined map, and the moves (3,) of the maps from their zeros, metres."""
+    """Return the parts of the joined map, and the shift (3,) of each map, metres."""
     config = next(iter(maps.values())).config
-    # whole blocks of stations, and whole tiles of all kinds
+    # shift by whole blocks of stations and whole tiles of all kinds
     edges = (config.block, config.tile, FIELD_CELL * FIELD_TILE, float(FEATURE_TILE))
     step = math.lcm(*(round(1000 * edge) for edge in edges)) / 1000.0
     gap = max(_MIN_GAP, 3.0 * config.descriptor.radius)

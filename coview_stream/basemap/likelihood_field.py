@@ -1,15 +1,15 @@
-"""Likelihood field of a map: rasters in which a pose is scored by looking up.
+"""Likelihood field of a map: rasters whose cells are looked up to score a pose.
 
 Square cells of half a metre, in tiles of 16 m that are stored only where the map has been surveyed:
 
-* occupied: one bit for each half metre of height. Bit ``floor(2 z) mod 64`` stands for height z in the map's frame, and
-  for heights 32 m above or below.
-* ground: height of the lowest surface at the cell's middle.
-* edge: height of the roof edges that walls must stand below (:func:`roof_edges`).
+* occupied: one bit per half metre of height. Bit ``floor(2 z) mod 64`` covers height z in the map's frame, and heights
+  that differ by multiples of 32 m.
+* ground: height of the lowest surface at the cell's centre.
+* edge: height of the roof edges below which walls must stand (:func:`roof_edges`).
 
-A map file holds it: 48 MB per km2. It is looked up in rasters that are made of it when a map is opened
-(:class:`~coview_kernels.reference.field.FieldLayers`), 88 MB per km2 of memory. Those of a node are memory-mapped: the
-working files of sites hold them as well, and those of other maps are kept in the cache.
+The field takes 48 MB per km2 of a map file. Opening a map derives the rasters for the look-ups, its layers
+(:class:`~coview_kernels.reference.field.FieldLayers`), 88 MB per km2 of memory. A node memory-maps the layers, from the
+working file of a site or from the cache.
 """
 
 from __future__ import annotations
@@ -28,13 +28,13 @@ from coview_stream.geometry.arrays import Bools, Floats, Floats32, Ints
 from coview_stream.geometry.rasters import max_filter, min_filter
 from coview_stream.geometry.transforms import Points
 
-_BASE = 8  # metres: a tile's heights count from a multiple of it
-_GROUND_BAND = 0.4  # metres above the lowest point nearby: still the ground
-_STEEPEST = 0.7  # of a normal's vertical part: steeper surfaces are no ground
-_GROUND_GROWTH = 2  # cells by which the ground is continued into cells without points
-_DROP = 2.0  # metres: lower drops are no walls
-_REACH = 5  # cells, odd: an edge is where the lowest top within it lies deeper than the drop
-_OVERHANG = 3  # cells, odd: a wall stands this close to the edge
+_BASE = 8  # metres: a tile's heights count from a multiple of this
+_GROUND_BAND = 0.4  # metres above the lowest point nearby that are still ground
+_STEEPEST = 0.7  # least vertical part of a ground normal
+_GROUND_GROWTH = 2  # cells by which the ground is extended into cells without points
+_DROP = 2.0  # metres: smaller drops are no walls
+_REACH = 5  # cells, odd: at an edge the lowest top in this window is lower by more than the drop
+_OVERHANG = 3  # cells, odd: a wall stands in this window around the edge
 _NOTHING = np.float32(-1e6)
 FIELD_ARRAYS = ("field.tiles", "field.occupied", "field.ground", "field.edge")
 LAYERS = "field.layers."
@@ -44,10 +44,10 @@ _Number = TypeVar("_Number", bound=np.generic)
 
 
 def field_arrays(points: Points, normals: Points, surveyed: Bools, corner: Floats, block: float) -> Arrays:
-    """Make the field of a cloud (N, 3), map frame, with unit normals (N, 3); arrays for the map's file.
+    """Build the field of a cloud (N, 3), map frame, with unit normals (N, 3), as arrays of the map's file.
 
-    ``surveyed`` (H, W) are the cells of ``block`` metres, a multiple of half a metre, that the map has been surveyed
-    in, row along y; ``corner`` (2,) is the lower corner of the first.
+    ``surveyed`` (H, W) masks the surveyed cells, row along y, of edge ``block``, a multiple of half a metre;
+    ``corner`` (2,) is the lower corner of cell (0, 0), metres.
     """
     ratio = round(block / CELL)
     low = np.rint(np.asarray(corner) / CELL).astype(np.int64)[::-1]  # row, column of the first cell
@@ -86,9 +86,9 @@ def field_arrays(points: Points, normals: Points, surveyed: Bools, corner: Float
 
 
 def layers_arrays(arrays: Arrays, zeros: Zeros | None = None, done: Callable[[], object] = lambda: None) -> Arrays:
-    """Return the rasters in which a map's field is looked up, for a working file.
+    """Return the layers of a map's field, for a working file.
 
-    ``zeros`` makes the arrays, None in memory; ``done`` is called after each batch.
+    ``zeros`` allocates the arrays, by default in memory; ``done`` is called after each batch.
     """
     field = field_of(arrays)
     layers = field.layers if zeros is None else field.made_layers(zeros, done)
@@ -118,7 +118,7 @@ def _tiles_of(raster: npt.NDArray[_Number], used: Ints) -> npt.NDArray[_Number]:
 
 
 def _ground_heights(points: Points, normals: Points, flat: Ints, shape: tuple[int, int]) -> Floats32:
-    """Return the ground's height (H, W) at the cells' middles, metres; NaN where there is none."""
+    """Return the ground height (H, W) at the cells' centres, metres; NaN where there is none."""
     size = shape[0] * shape[1]
     lowest = np.full(size, np.inf, dtype=np.float32)
     np.minimum.at(lowest, flat, points[:, 2])
@@ -137,7 +137,7 @@ def _ground_heights(points: Points, normals: Points, flat: Ints, shape: tuple[in
 
 
 def _grown(ground: Floats) -> Floats:
-    """Continue the ground (H, W) into the cells around it, as the mean of those that know it."""
+    """Extend the ground (H, W) into the cells around it, each the mean of its known neighbours."""
     for _ in range(_GROUND_GROWTH):
         has = np.isfinite(ground)
         padded, there = np.pad(np.where(has, ground, 0.0), 1), np.pad(has, 1).astype(np.float64)
@@ -152,11 +152,11 @@ def _grown(ground: Floats) -> Floats:
 
 
 def roof_edges(top: Floats32) -> Floats32:
-    """Find the edges of roofs, below which a map seen from above must have walls.
+    """Find the edges of roofs, below which a site surveyed from above must have walls.
 
     Args:
-        top: (H, W) greatest height of half-metre cells, metres; -1e6 in empty cells, which count as low: below a roof's
-            edge there are often no points.
+        top: (H, W) greatest height of half-metre cells, metres; -1e6 in empty cells, which count as low because there
+            are often no points below a roof's edge.
 
     Returns:
         (H, W) height of the edges; -1e6 where there is none.

@@ -1,7 +1,7 @@
-"""Arrays of a map file, made of the clouds and stations of its tiles; the only place that makes them.
+"""Arrays of a map file, built only here, from the clouds and stations of the map's tiles.
 
-A map built as one file is one tile in memory (:class:`MemoryTile`). A site's working file is made of many tiles, whose
-clouds lie in files, one after the other: memory is bounded by a tile, not by the map.
+A map built as one file is one tile in memory (:class:`MemoryTile`). A site's working file is built tile by tile from
+clouds in files, so memory is bounded by a tile, not by the map.
 """
 
 from __future__ import annotations
@@ -33,19 +33,19 @@ _COPIED = 1 << 15  # stations copied at a time: 16 MB of each tier
 
 
 class Tiles(Protocol):
-    """Clouds and stations that a map is made of."""
+    """Clouds and stations of a map's tiles."""
 
     config: MapConfig
 
     @property
     def stations(self) -> Mapping[Key, Floats32]:
-        """(M, 3) stations of each tile, in the order of the map's arrays."""
+        """Stations (M, 3) of each tile, in the order of the map's arrays."""
 
     def cells(self, beside: bool) -> Ints:
-        """Return column and row (K, 2) of the blocks that hold points; ``beside``: also those of tiles around."""
+        """Return column and row (K, 2) of the blocks that hold points; with ``beside`` also blocks of tiles around."""
 
     def described(self, wanted: Ints, keys: Collection[Key] | None = None) -> Iterator[tuple[Described, Ints]]:
-        """Yield descriptors of the stations ``wanted`` (numbers in the map) on all tiles or some, with the numbers."""
+        """Yield descriptors of the stations ``wanted`` that lie on all tiles or on ``keys``, with their map numbers."""
 
     def field(self, key: Key, surveyed: Bools, corner: Floats) -> Arrays:
         """Return the likelihood field of a tile; no arrays where nothing is surveyed."""
@@ -63,7 +63,7 @@ class MemoryArrays:
         return self._parts[name][0]
 
     def append(self, name: str, rows: npt.NDArray[Any]) -> int:
-        """Append rows (N, ...) to an array, and return how many it had."""
+        """Append rows (N, ...) to an array, and return its earlier length."""
         parts = self._parts.setdefault(name, [])
         parts.append(rows)
         return sum(map(len, parts[:-1]))
@@ -104,8 +104,8 @@ class MemoryTile:
 class EarlierMap:
     """Arrays of an earlier state of a site, from which unchanged tiles are copied; by default empty.
 
-    The field and the codes of a tile depend on its stations and on the clouds on it and around it. Codes of other tiles
-    are made with the earlier basis; they find the same stations (tests/basemap/site/test_working_file.py).
+    The field and the codes of a tile depend on its stations and on the clouds on and around it. Changed tiles are coded
+    with the earlier basis; their codes find the same stations (tests/basemap/site/test_working_file.py).
     """
 
     def __init__(
@@ -126,9 +126,9 @@ class EarlierMap:
         return {name: self.arrays[name][self._spans[key][1]] for name in FIELD_ARRAYS} if key in self._spans else None
 
     def tiers(self, into: Sequence[I16]) -> list[StationCodes] | None:
-        """Return codes with the earlier map's basis, to fill in.
+        """Return codes with the earlier map's basis, to be filled in.
 
-        None if no tile is unchanged, or if the basis was learned from fewer stations than a new one would be.
+        None if every tile has changed, or if the basis was learned from fewer stations than a new one would be.
         """
         if self._index is None or not self._spans:
             return None
@@ -149,10 +149,10 @@ class EarlierMap:
 def map_arrays(
     tiles: Tiles, into: MemoryArrays, earlier: EarlierMap | None = None, step: Callable[[], None] = lambda: None
 ) -> tuple[Arrays, dict[Key, int]]:
-    """Make stations, surveyed cells, likelihood field and station codes of a map, and the number of field rows by tile.
+    """Build stations, surveyed cells, likelihood field and station codes of a map, and count field rows by tile.
 
-    Large arrays are made in ``into``; those that it has already are returned as well. ``step`` is called twice for each
-    tile. MapError if there are too many stations, or no room.
+    Large arrays are built in ``into``; its earlier arrays are returned as well. ``step`` is called twice per tile.
+    MapError if there are too many stations, or no room.
     """
     earlier = EarlierMap() if earlier is None else earlier
     stations = sum(map(len, tiles.stations.values()))
@@ -177,7 +177,7 @@ def map_arrays(
 def _station_codes(
     tiles: Tiles, stations: int, into: MemoryArrays, earlier: EarlierMap, step: Callable[[], None]
 ) -> Arrays:
-    """Make the station codes in ``into``, and return the other arrays of the station index.
+    """Build the station codes in ``into``, and return the other arrays of the station index.
 
     Descriptors of all stations are never in memory at once, unless the tiles hold them.
     """
@@ -233,7 +233,7 @@ def cells_of(points: Points, block: float) -> Ints:
 def surveyed_around(cells: Ints, block: float) -> tuple[npt.NDArray[np.uint8], Floats]:
     """Mask cells (H, W) that hold points, given as (K, 2), or touch one that does; also return the lower corner (2,).
 
-    The neighbours bridge the shadows of buildings, which have no points but were surveyed.
+    The neighbours bridge the shadows of buildings, which were surveyed but have no points.
     """
     low = cells.min(axis=0) - _SURVEY_MARGIN
     columns, rows = (cells - low).T

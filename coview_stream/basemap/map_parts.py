@@ -1,4 +1,4 @@
-"""Parts of a joined map: the part at a place, and poses between the joined frame and a part's own frame."""
+"""Parts of a joined map, and poses between the joined frame and a part's own frame."""
 
 from __future__ import annotations
 
@@ -19,14 +19,14 @@ _MAX_METRES = 1e8
 
 @dataclass(frozen=True)
 class MapPart:
-    """One of the maps.
+    """One map of a joined map.
 
     Attributes:
-        name: of the map.
-        sha256: of the map.
+        name: name of the map.
+        sha256: hash of the map.
         crs: reference system of its own frame, None if unknown.
         shift: (3,) metres, from its own frame to the joined frame.
-        begin, end: its range of x in the joined frame, with half of the gaps to its neighbours.
+        begin, end: its range of x in the joined frame, metres, including half of the gaps to its neighbours.
     """
 
     name: str
@@ -58,11 +58,7 @@ class MapParts(Sequence[MapPart]):
 
     @classmethod
     def of(cls, parameters: Mapping[str, Any]) -> MapParts | None:
-        """Return the parts in a map's parameters; None for a map that was not joined.
-
-        Raises:
-            MapError: they cannot be read.
-        """
+        """Return the parts in a map's parameters, None for a map that was not joined; MapError if they are invalid."""
         rows = parameters.get("parts")
         if rows is None:
             return None
@@ -83,12 +79,12 @@ class MapParts(Sequence[MapPart]):
         return len(self._parts)
 
     def at(self, position: Floats) -> MapPart:
-        """Return the part at a place (3,) in the joined frame."""
+        """Return the part at a position (3,) in the joined frame."""
         number = int(np.searchsorted(self._begins, position[0], side="right")) - 1
         return self._parts[max(number, 0)]
 
     def named(self, name: str | None) -> MapPart:
-        """Return a part by its name; InputError if there is none; the message names the parts."""
+        """Return a part by its name; InputError, which lists the parts, if there is none."""
         for part in self._parts:
             if part.name == name:
                 return part

@@ -1,7 +1,7 @@
-"""Signatures of map files: ed25519, with keys as PEM files, which ``openssl`` makes and reads as well.
+"""Signatures of map files: ed25519, with keys in PEM files, which ``openssl`` writes and reads too.
 
-The signature is in the file's header, over the header and the hashes of all arrays: a map and its signature are copied
-and replaced as one.
+The signature covers the file's header with the hashes of all arrays. The header holds the signature, so a map and its
+signature are copied and replaced together.
 """
 
 from __future__ import annotations
@@ -18,18 +18,18 @@ from typing import Any, BinaryIO, NamedTuple
 from coview_stream.errors import InputError, MapError, require_library
 
 REQUIREMENT = "cryptography>=42"
-_DOMAIN = b"coview-map ed25519 1\n"  # no other use of a key signs bytes that could pass for a map
+_DOMAIN = b"coview-map ed25519 1\n"  # domain separation: no other use of a key signs such bytes
 _PURPOSE = "signed maps"
-_MAX_KEY = 1 << 14  # bytes of a key's file; a PEM file of this kind has some 120
+_MAX_KEY = 1 << 14  # bytes of a key's file; an ed25519 PEM file has some 120
 
 
 @dataclass(frozen=True)
 class VerifyKey:
-    """Public key that maps have to be signed with.
+    """Public key that verifies maps.
 
     Attributes:
         raw: its 32 bytes.
-        name: the file it was read from, for messages.
+        name: its file, for messages.
     """
 
     raw: bytes
@@ -37,11 +37,11 @@ class VerifyKey:
 
     @property
     def fingerprint(self) -> str:
-        """First half of the sha256 of the key's bytes, in hexadecimal digits."""
+        """First half of the sha256 of the key's bytes, hexadecimal."""
         return sha256_of([self.raw])[:32]
 
     def verifies(self, message: bytes, signature: bytes) -> bool:
-        """Tell whether the key's owner has signed the message."""
+        """Return whether the key's owner has signed the message."""
         library = _library("asymmetric.ed25519")
         invalid = require_library("cryptography.exceptions", REQUIREMENT, _PURPOSE).InvalidSignature
         try:
@@ -52,13 +52,13 @@ class VerifyKey:
 
 
 class SigningKey:
-    """Private key that maps are signed with, from a PEM file that is not encrypted.
+    """Private key that signs maps, from an unencrypted PEM file.
 
     Attributes:
-        fingerprint: of its public key.
+        fingerprint: fingerprint of its public key.
 
     Raises:
-        InputError: it cannot be read, or holds no private ed25519 key. DependencyError: no ``cryptography``.
+        InputError: the file cannot be read, or holds no private ed25519 key. DependencyError: no ``cryptography``.
     """
 
     def __init__(self, path: str | os.PathLike[str]) -> None:
@@ -78,7 +78,7 @@ class SigningKey:
         self.fingerprint = VerifyKey(key.public_key().public_bytes_raw(), "").fingerprint
 
     def sign(self, message: bytes) -> bytes:
-        """Return the 64 bytes that only the owner of this key can make of the message."""
+        """Return the signature of a message, 64 bytes."""
         return bytes(self._key.sign(_DOMAIN + message))
 
 
@@ -105,13 +105,13 @@ def read_verify_key(path: str | os.PathLike[str]) -> VerifyKey:
 
 
 def make_keys(name: str | os.PathLike[str]) -> tuple[Path, Path, str]:
-    """Write a new pair of keys, ``NAME.key`` (readable by its owner only) and ``NAME.pub``.
+    """Write a new pair of keys, ``NAME.key`` (readable only by its owner) and ``NAME.pub``.
 
     Returns:
         Both paths and the fingerprint.
 
     Raises:
-        InputError: one of them exists, or cannot be written. DependencyError: no ``cryptography``.
+        InputError: a file exists or cannot be written. DependencyError: no ``cryptography``.
     """
     private, public = Path(f"{os.fspath(name)}.key"), Path(f"{os.fspath(name)}.pub")
     form = _library("serialization")
@@ -152,7 +152,7 @@ def _read(path: str | os.PathLike[str]) -> bytes:
 
 
 class FileIdentity(NamedTuple):
-    """State of a file; it changes when the file is written or replaced."""
+    """State of a file, which changes when the file is written or replaced."""
 
     device: int
     inode: int
@@ -162,12 +162,12 @@ class FileIdentity(NamedTuple):
 
 
 class Trust(NamedTuple):
-    """Demand that a file is signed.
+    """Requirement that a file is signed.
 
     Attributes:
-        key: public key of who may sign.
-        verified: of a file whose arrays have been compared with their hashes already; they are not read again if it is
-            still that. None compares them.
+        key: public key of the signer.
+        verified: identity of a file whose arrays have already been compared with their hashes; a file with this
+            identity is not read again. None always compares.
     """
 
     key: VerifyKey
@@ -175,7 +175,7 @@ class Trust(NamedTuple):
 
 
 def open_plain(path: Path) -> BinaryIO:
-    """Open a file to read; OSError for a pipe as well, as opening one waits for a writer."""
+    """Open a file for reading; OSError also for a pipe, because opening one waits for a writer."""
     if path.is_fifo():
         raise OSError(errno.ESPIPE, "it is a pipe")
     return path.open("rb")
@@ -188,22 +188,22 @@ def file_identity(file: BinaryIO) -> FileIdentity:
 
 
 def serialized(header: dict[str, Any]) -> bytes:
-    """Return a header as it is written and, without its signature, as it is signed."""
+    """Serialise a header for writing or, without its signature, for signing."""
     return json.dumps(header, separators=(",", ":")).encode()
 
 
 def sign_header(header: dict[str, Any], sections: dict[str, str], key: SigningKey) -> None:
-    """Put hashes of the arrays, by name, and a signature of all that into a header."""
+    """Add the arrays' hashes, by name, to a header, and sign it."""
     metadata = header["__metadata__"]
     metadata |= {"sections": json.dumps(sections), "signer": key.fingerprint}
     metadata["signature"] = key.sign(serialized(header)).hex()
 
 
 def check_signature(path: Path, header: dict[str, Any], exact: bool, key: VerifyKey) -> None:
-    """Verify a header as it was read; ``exact``: the file holds it byte for byte as we write it.
+    """Verify a header that was read; ``exact``: the file holds the very bytes that we would write for it.
 
     Raises:
-        MapError: it is not signed, not by this key, or has been changed since.
+        MapError: it is unsigned, signed by another key, or changed since.
     """
     metadata = header["__metadata__"]
     if "signature" not in metadata:
@@ -216,7 +216,7 @@ def check_signature(path: Path, header: dict[str, Any], exact: bool, key: Verify
         signature = bytes.fromhex(metadata["signature"])
     except (TypeError, ValueError):
         signature = b""
-    exact = exact and signature.hex() == metadata["signature"]  # nor in capitals
+    exact = exact and signature.hex() == metadata["signature"]  # no capital digits either
     if exact and key.verifies(serialized(signed), signature):
         return
     by = str(metadata.get("signer"))[:32]
@@ -229,7 +229,7 @@ def check_signature(path: Path, header: dict[str, Any], exact: bool, key: Verify
 
 
 def check_sections(header: dict[str, Any], content: Callable[[str], Iterable[bytes]]) -> None:
-    """Compare the content of each array with its signed hash; ValueError if one differs, or not all have one."""
+    """Compare each array with its signed hash; ValueError if one differs or is missing."""
     sections = json.loads(header["__metadata__"]["sections"])
     names = header.keys() - {"__metadata__"}
     if sections.keys() != names:
@@ -240,7 +240,7 @@ def check_sections(header: dict[str, Any], content: Callable[[str], Iterable[byt
 
 
 def sha256_of(chunks: Iterable[bytes | memoryview]) -> str:
-    """Return the sha256 of bytes that come in pieces."""
+    """Return the sha256 of bytes in chunks."""
     total = hashlib.sha256()
     for chunk in chunks:
         total.update(chunk)

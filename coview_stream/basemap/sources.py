@@ -1,4 +1,4 @@
-"""Sources of a base map: cloud files, and arrays of points that are in memory."""
+"""Sources of a base map: cloud files, and arrays of points in memory."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ from coview_stream.geometry.arrays import Reals
 from coview_stream.geometry.validation import to_array
 
 Given = str | os.PathLike[str] | npt.NDArray[Any]
-"""A source as callers give it: a file, or (N, 3) points."""
+"""A source from a caller: a file, or (N, 3) points."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -36,10 +36,10 @@ class Source:
     """One source.
 
     Attributes:
-        path: the file; of an array its name, for messages.
-        rows: (N, 3) float32 or float64 coordinates of an array, metres; None of a file.
-        crs: reference system of an array, or of a file that states none; of metres.
-        unit: of such coordinates, if it is not the metre.
+        path: the file, or an array's name for messages.
+        rows: (N, 3) float32 or float64 coordinates of an array, metres; None for a file.
+        crs: reference system, in metres, of an array or of a file that states none.
+        unit: unit of such coordinates, if it is not the metre.
     """
 
     path: Path
@@ -48,7 +48,7 @@ class Source:
     unit: SurveyUnit | None = None
 
     def head(self) -> CloudHead:
-        """Read the file's head, without the points; CloudError if it cannot be used."""
+        """Read the file's head without the points; CloudError if it cannot be used."""
         head = CloudHead(self.path) if self.rows is not None else read_head(self.path)
         if self.crs is None or head.crs is not None or head.unit is not None:
             return head
@@ -58,10 +58,9 @@ class Source:
         return replace(head, crs=self.crs, unit=self.unit, low=low, high=high)
 
     def unit_to_convert(self) -> SurveyUnit | None:
-        """Return the unit from which its points have to be converted: a file's own is, as it is read.
+        """Return the unit from which points have to be converted; readers convert a unit that the file states.
 
-        Raises:
-            CloudError: an E57 file, whose metres are in its standard.
+        CloudError for an E57 file, which is in metres by its standard.
         """
         if self.unit is None or self.head().unit is not self.unit:
             return None
@@ -70,7 +69,7 @@ class Source:
         return self.unit
 
     def read(self) -> Cloud:
-        """Return the points; CloudError if there are none, or if no map can be made in their reference system."""
+        """Return the points; CloudError if there are none, or if their reference system allows no map."""
         unit = self.unit_to_convert()
         if self.rows is None:
             cloud = read_cloud(self.path)
@@ -91,7 +90,7 @@ class Source:
         return replace(cloud, crs=self.crs)
 
     def sha256(self) -> str:
-        """Return the hash of the file, or of the array's numbers, row by row."""
+        """Return the hash of the file, or of the array's numbers row by row."""
         if self.rows is not None:
             return hashlib.sha256(np.ascontiguousarray(self.rows).data).hexdigest()
         with self.path.open("rb") as file:
@@ -99,11 +98,11 @@ class Source:
 
 
 def sources_of(given: Given | Sequence[Given], crs: str | None = None) -> list[Source]:
-    """Return the sources that files, folders, patterns and arrays (N, 3 or more) mean; ``crs`` of those without one.
+    """Return the sources for files, folders, patterns and arrays (N, 3 or more); ``crs`` is for those without one.
 
     Raises:
-        MapError: there is none, or a file is named twice. CloudError: an array is no cloud.
-        ConfigError: ``crs`` is no text, or no system of metres.
+        MapError: there is no source, or a file is named twice. CloudError: an array is no cloud.
+        ConfigError: ``crs`` is no text, or no system in metres.
     """
     if not isinstance(crs, str | None):
         raise ConfigError(f"crs is {crs!r}; give text such as 'EPSG:28992', or WKT")
@@ -123,7 +122,7 @@ def sources_of(given: Given | Sequence[Given], crs: str | None = None) -> list[S
             sources += [Source(path, None, crs, unit) for path in expand_cloud_paths([item])]
         else:
             name = "array" if arrays == 1 else f"array {number}"
-            array = np.asarray(item) if hasattr(item, "__array__") else None  # pandas and tensors have it, too
+            array = np.asarray(item) if hasattr(item, "__array__") else None  # pandas frames and tensors have it too
             if array is None or array.ndim != 2 or array.shape[1] < 3:
                 flaw = f"is a {type(item).__name__}" if array is None else f"has shape {array.shape}"
                 raise CloudError(f"{name} {flaw}; give a cloud file, or an array (N, 3) of metres")
@@ -138,7 +137,7 @@ def sources_of(given: Given | Sequence[Given], crs: str | None = None) -> list[S
 
 
 def warn_of_other_systems(sources: Sequence[Source], heads: Sequence[CloudHead]) -> None:
-    """Warn that coordinates are converted, and that the system given for files is not that of files which have one."""
+    """Warn of converted coordinates, and of files whose own reference system overrides the given one."""
     converted = [(head.path, head.unit.name) for head in heads if head.unit is not None]
     if converted:
         more = f" and {len(converted) - 1} more" if len(converted) > 1 else ""
@@ -153,6 +152,6 @@ def warn_of_other_systems(sources: Sequence[Source], heads: Sequence[CloudHead])
 
 
 def short_names(paths: Sequence[Path]) -> list[str]:
-    """Return the file names of paths; of files with the same name the whole paths."""
+    """Return the file names of paths, but whole paths for files with the same name."""
     names = [path.name for path in paths]
     return [path.name if names.count(path.name) == 1 else str(path) for path in paths]

@@ -1,7 +1,7 @@
-"""Station index: codes of all stations' descriptors in two tiers of 512 bytes each, and z-scores of queries by them.
+"""Station index: codes of all stations' descriptors in two tiers of 512 bytes each, and the z-scores of queries.
 
-The first tier, of the largest components, screens all stations; the second is added for single scores. The index is in
-the map's file, and replaces the descriptors in a search, which take five times as much memory.
+The first tier, with the largest components, screens all stations; single scores add the second. A map's file holds the
+index, which replaces the descriptors in a search and takes a fifth of their memory.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ from coview_stream.geometry.arrays import Complexes, Floats32, Ints
 Descriptors = Mapping[Channel, npt.NDArray[Any]]
 """(M, R, S) of each channel."""
 
-_SAMPLE = 128  # stations whose scores at all shifts give the medians
+_SAMPLE = 128  # stations whose scores at all shifts give median and spread
 CODES = ("station_codes", "station_codes.rest")  # names of the tiers' codes in a map's file
 _SAMPLED = "station_codes.sample"
 
@@ -33,9 +33,10 @@ class ScoredQuery:
     """A query of :class:`StationIndex`.
 
     Attributes:
-        coded, rest: by tier, its channels weighted by the inverse of their spread; no ``rest`` without a second tier.
-        screen_zero: z-score of zero correlation by the first tier alone.
-        zero: the same by both tiers.
+        coded, rest: codes in each tier, channels weighted by the inverse of their spread; no ``rest`` without a second
+            tier.
+        screen_zero: z-score of zero correlation in the first tier alone.
+        zero: the same in both tiers.
     """
 
     coded: CodedQuery
@@ -47,19 +48,19 @@ class ScoredQuery:
 class StationIndex:
     """Codes of the stations' descriptors (:class:`coview_kernels.StationCodes`), and a sample of the descriptors.
 
-    A z-score is the distance (eqs 7-9) minus the median, in robust standard deviations of all stations and shifts (from
-    the sample), averaged over the channels; negative is better.
+    A z-score is the distance (eqs 7-9) minus the median, in robust standard deviations, averaged over the channels;
+    negative is better. The sample at all shifts gives median and deviation.
     """
 
     def __init__(self, codes: StationCodes, rest: StationCodes | None, sample: Descriptors) -> None:
-        # the second tier is optional; ``sample``: the descriptors of the stations of sampled_stations()
+        # ``rest``: optional second tier; ``sample``: descriptors of the sampled_stations()
         self.codes = codes
         self.rest = rest
         self._descriptors = sample
 
     @classmethod
     def of(cls, descriptors: Descriptors) -> StationIndex:
-        """Make the index of stations from their descriptors; MapError if too many stations."""
+        """Build the index from the stations' descriptors; MapError if there are too many stations."""
         stations = len(next(iter(descriptors.values())))
         if stations > StationCodes.MAX_STATIONS:
             limit = StationCodes.MAX_STATIONS
@@ -71,7 +72,7 @@ class StationIndex:
 
     @classmethod
     def from_arrays(cls, arrays: Mapping[str, npt.NDArray[Any]], channels: Collection[Channel]) -> StationIndex | None:
-        """Return the index in a map's arrays, None if there is none of these channels."""
+        """Return the index in a map's arrays, None if it has none for these channels."""
         if any(name not in arrays for tier in CODES for name in _names(tier)) or _SAMPLED not in arrays:
             return None
         sample, stations = arrays[_SAMPLED], len(arrays[CODES[0]])
@@ -100,7 +101,7 @@ class StationIndex:
     def subset(self, stations: Ints, second: bool = True) -> StationIndex:
         """Return the index of stations (K,), copied into memory, with or without the second tier.
 
-        Queries are standardised by the sample of the whole index.
+        The sample of the whole index standardises its queries.
         """
         rest = self.tiers[1].subset(stations) if second else None
         index = StationIndex(self.codes.subset(stations), rest, self._descriptors)
@@ -125,7 +126,7 @@ class StationIndex:
 
     @cached_property
     def _sample(self) -> tuple[StationCodes, StationCodes, dict[Channel, Complexes]]:
-        """Sample by which queries are standardised: codes by tier, and spectra of the descriptors by channel."""
+        """Sample that standardises queries: codes by tier, and spectra of the descriptors by channel."""
         codes, rest = (tier.subset(sampled_stations(len(self))) for tier in self.tiers)
         spectra = {name: kernels.column_spectra(d.astype(np.float32)) for name, d in self._descriptors.items()}
         return codes, rest, spectra
@@ -137,7 +138,7 @@ class StationIndex:
             _ = self.best(query), self.at(query, [0], [0])
 
     def query(self, descriptors: Mapping[Channel, Floats32]) -> ScoredQuery:
-        """Prepare to score a query's descriptors (R, S) by channel, the index's own channels."""
+        """Prepare a query from its descriptors (R, S) by channel, in the index's channels."""
         sample, sample_rest, all_spectra = self._sample
         stations = np.arange(len(sample))
         mean = np.zeros((len(stations), self.sectors), dtype=np.float32)
@@ -150,7 +151,7 @@ class StationIndex:
             columns.append(kernels.unit_columns(descriptors[name]) * weight)
         stacked = np.concatenate(columns)
         coded = self.codes.query(stacked)
-        # codes leave out components of every query; correct the mean
+        # codes drop components of every query; correct the mean
         mean += sample.all_shifts(coded, stations)
         screen_zero = float(np.median(mean))
         if self.rest is None:
@@ -160,7 +161,7 @@ class StationIndex:
         return ScoredQuery(coded, rest, screen_zero, float(np.median(mean)))
 
     def best(self, query: ScoredQuery) -> Floats32:
-        """Return the best z-score (M,) of each station at any heading, by the first tier."""
+        """Return each station's best z-score (M,) over all shifts, by the first tier."""
         return np.float32(query.screen_zero) - self.codes.best(query.coded)
 
     def all_shifts(self, query: ScoredQuery, stations: Ints) -> Floats32:
@@ -185,7 +186,7 @@ class StationIndex:
 
 
 def sampled_stations(stations: int) -> Ints:
-    """Return the numbers (K,) of the stations whose descriptors an index stores exactly, evenly spaced."""
+    """Return the numbers (K,), evenly spaced, of the stations whose descriptors an index stores exactly."""
     return np.arange(0, stations, max(1, -(-stations // _SAMPLE)))
 
 

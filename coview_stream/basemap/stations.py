@@ -18,19 +18,19 @@ from coview_stream.geometry.rasters import cells, lowest_per_cell
 from coview_stream.geometry.transforms import Points
 
 # floors of buildings
-_SUBCELL = 0.5  # metres: airborne scans of 8 points/m2 still fill two
+_SUBCELL = 0.5  # metres: an airborne scan of 8 points/m2 has two in each such cell
 _STEP = 0.1  # metres: height resolution of the columns
-_SAME_LEVEL = 1.0  # metres: closer heights of one cell are one level
+_SAME_LEVEL = 1.0  # metres: closer heights in a cell are one level
 _HEADROOM = 1.8  # metres of free height above a floor
-_COVER = 6.0  # metres within which a flat surface lies above a floor: a roof in the open has none
-_MIN_AREA = 25.0  # square metres, connected: most smaller floors are overhangs
-_FLATNESS = 2  # steps of height between neighbouring half-metre cells
+_COVER = 6.0  # metres above a floor within which it has a flat cover, unlike a roof in the open
+_MIN_AREA = 25.0  # square metres of a connected floor: most smaller ones are overhangs
+_FLATNESS = 2  # height steps between neighbouring half-metre cells
 
 Described = dict[Channel, npt.NDArray[np.float16]]
 """(M, R, S) of each channel."""
 RASTER_CELL = 0.5  # metres; a tenth of a bin's width at the rim, a fifth of its depth
 _PORTION = 512  # stations at a time: 7 MB of bins
-_DENSE = 64  # voxels of a raster for each point, up to which a table of all is faster than a sort of the points
+_DENSE = 64  # voxels of a raster per point, up to which a table of all voxels is faster than sorting the points
 _STOREY = 1.0  # metres: indoor stations whose floors differ less are described together
 _BELOW_FLOOR = 1.0  # metres below the floor that still belong to the storey
 _MAX_STOREYS = 1024  # a kilometre from the lowest indoor station to the highest
@@ -40,7 +40,7 @@ LEVEL_GAP = 2.5
 
 
 def below_another(stations: Points, cell: float) -> Bools:
-    """Mask the stations (M, 3) that have another one above them in their ``cell``-sized square."""
+    """Mask the stations (M, 3) with another station above them in their ``cell``-sized square."""
     if not len(stations):
         return np.zeros(0, dtype=bool)
     _, _, flat = cells(stations, cell)
@@ -51,7 +51,7 @@ def below_another(stations: Points, cell: float) -> Bools:
 
 
 def indoor_floors(points: Points) -> Points:
-    """Return the half-metre cells (K, 3) of all covered floors, also of the lowest storey, metres."""
+    """Return the half-metre cells (K, 3) of all covered floors including the lowest storey, metres."""
     corner, shape, flat = cells(points, _SUBCELL)
     level = np.floor(points[:, 2] / np.float32(_STEP)).astype(np.int64)
     base = int(level.min())
@@ -70,11 +70,11 @@ def indoor_floors(points: Points) -> Points:
 
 
 def _flat_and_wide(column: Ints, floor: Ints, ceiling: Ints, shape: tuple[int, int]) -> Bools:
-    """Mask the candidates in wide connected pieces, whose floor and ceiling go on in the neighbouring cells."""
+    """Mask the candidates in wide connected pieces whose floor and ceiling continue in the neighbouring cells."""
     wide = np.zeros(len(column), dtype=bool)
-    # candidates of one column differ by the headroom at least, so each slab holds one of a column
+    # candidates of a column differ by at least the headroom, so each slab holds one per column
     slab_height = int(_HEADROOM / _STEP)
-    # slabs overlap by half, or a floor that lies across a border would be cut
+    # slabs overlap by half, so that no border cuts a floor
     for shift in (0, slab_height // 2):
         slab = (floor + shift) // slab_height
         for number in np.unique(slab):
@@ -88,7 +88,7 @@ def _one_slab(column: Ints, floor: Ints, ceiling: Ints, shape: tuple[int, int]) 
     from scipy import ndimage  # not part of the robot's side
 
     row, col = np.divmod(column, shape[1])
-    # crop to where this slab has candidates; one cell of border keeps neighbours inside
+    # crop to this slab's candidates; one cell of border keeps neighbours inside
     row, col = row - row.min() + 1, col - col.min() + 1
     size = (int(row.max()) + 2, int(col.max()) + 2)
     low, high = np.full(size, np.nan, np.float32), np.full(size, np.nan, np.float32)
@@ -109,7 +109,7 @@ def _one_slab(column: Ints, floor: Ints, ceiling: Ints, shape: tuple[int, int]) 
 
 
 def _upper_squares(floors: Points, base: Points, cell: float) -> Points:
-    """Find the squares of floors that lie above the base level of their cell and cover a quarter of it."""
+    """Find the squares of floors above the base level of their cell that cover a quarter of the cell."""
     from scipy import ndimage  # not part of the robot's side
 
     if not len(floors):
@@ -141,10 +141,10 @@ def _upper_squares(floors: Points, base: Points, cell: float) -> Points:
 def find_stations(points: Points, block: float, levels: bool = True) -> Floats32:
     """Put stations (M, 3), one per ``block``-sized cell that has ground, at its centre and median ground height.
 
-    With ``levels`` there is one more for every floor *indoors* above it: flat, wide, with headroom and a flat cover. An
-    upper storey counts; a roof, a bridge deck or an open parking deck (no cover) and a canopy (not flat) do not.
-    Heights of upper levels are good to 0.1 m. (The authors' program takes centroids of 3-D
-    voxels, which puts two stations into 5 % of the cells.)
+    With ``levels``, every *indoor* floor above it adds a station: flat, wide, with headroom and a flat cover. An upper
+    storey counts; a roof, a bridge deck or an open parking deck (no cover) and a canopy (not flat) do not. Heights of
+    upper levels are accurate to 0.1 m. (The authors' program takes centroids of 3-D voxels, which puts two stations
+    into 5 % of the cells.)
     """
     mask = ground_mask(points)
     if not mask.any():
@@ -168,27 +168,27 @@ def describe_storeys(
     progress: Progress | None = None,
     wanted: Ints | None = None,
 ) -> Described:
-    """Describe stations by channels (M, R, S), those with a storey above them storey by storey.
+    """Describe stations by channels (M, R, S); stations below another storey are described storey by storey.
 
-    A robot below another floor sees that floor, not the roof: such stations of similar height share a raster of the
-    points from a metre below their floor up to the highest possible ceiling.
+    A robot below another floor sees that floor, not the roof. Such stations of similar height therefore share a raster
+    of the points from a metre below their floor up to the highest possible ceiling.
 
     Args:
-        points: (N, 3), at least those within the radius and two blocks of the stations.
+        points: (N, 3), at least all points within the radius plus two blocks of the stations.
         stations: (M, 3), with all stations of their blocks.
         block: metres.
-        config: of the descriptors.
-        progress: called with stations done and all stations.
+        config: settings of the descriptors.
+        progress: called with the numbers of stations done and of all stations.
         wanted: (K,) numbers of the stations to describe, in the order of the result; None takes all.
 
     Raises:
-        MapError: they stand on more than 1,024 storeys, or beside all points.
+        MapError: the stations stand on more than 1,024 storeys, or beside all points.
     """
     indoors = below_another(stations, block)
     if wanted is not None:
         stations, indoors = stations[wanted], indoors[wanted]
     corner = aligned_corner(points, block, RASTER_CELL)
-    # a block at the upper edge may have its centre beyond the last point
+    # the centre of a block at the upper edge may lie beyond the last point
     margin = int(np.ceil(block / RASTER_CELL))
     storey = np.where(indoors, np.round(stations[:, 2] / _STOREY), np.inf)
     shape = (len(stations), config.rings, config.sectors)
@@ -252,15 +252,15 @@ def describe_stations(
 
 @dataclass(frozen=True)
 class HeightRaster:
-    """Raster of a cloud: greatest height, number of occupied voxels and perhaps their mean height, of square cells.
+    """Raster of a cloud in square cells: greatest height, number of occupied voxels, and optionally their mean height.
 
-    Arrays are (H, W): row along y, column along x; cell (r, c) has its centre at
+    Arrays are (H, W), row along y and column along x; the centre of cell (r, c) is
     ``corner + cell * (c + 1/2, r + 1/2)``.
 
     Attributes:
         top: greatest height, metres, map frame; 0 in empty cells.
-        count: occupied voxels.
-        mean: mean height of one point of each voxel, metres, map frame; 0 in empty cells; None if not asked for.
+        count: number of occupied voxels.
+        mean: mean height of one point per voxel, metres, map frame; 0 in empty cells; None if not requested.
         corner: (2,) lower left corner, metres, map frame.
         cell: edge, metres.
     """
@@ -278,9 +278,9 @@ class HeightRaster:
 
 
 def aligned_corner(points: Points, block: float, cell: float) -> Floats:
-    """Return the lower left corner (2,) of a raster whose cells have the centres of ``block``-sized cells among theirs.
+    """Return the lower left corner (2,) of a raster with a cell centred on the centre of every ``block``-sized cell.
 
-    Stations stand at ``(k + 1/2) * block``, a multiple of ``cell``; the shift lets one offset table serve them all.
+    Stations stand at ``(k + 1/2) * block``, a multiple of ``cell``; the shift lets one offset table serve all of them.
     """
     lowest = np.floor(points[:, :2].min(axis=0).astype(np.float64) / block) * block
     return np.asarray(lowest + 0.5 * block - cell * (np.ceil(0.5 * block / cell) + 0.5))
@@ -290,16 +290,16 @@ def rasterise(
     points: Points, corner: Floats, cell: float, voxel: float, margin: int = 0, extent: Points | None = None,
     means: bool = False,
 ) -> HeightRaster:  # fmt: skip
-    """Raster (N, 3) map-frame points, to the farthest of ``extent`` (default: the points) and ``margin`` cells beyond.
+    """Raster (N, 3) map-frame points over ``extent`` (default: the points) and ``margin`` cells beyond.
 
-    The density of a cell (eq. 3) counts occupied voxels of edge ``voxel``: counts of points depend on the scan pattern.
+    The density of a cell (eq. 3) counts occupied voxels of edge ``voxel``, as point counts depend on the scan pattern.
     """
     column, row = (np.floor((points[:, k] - corner[k]) / cell).astype(np.int64) for k in (0, 1))
     level = np.floor(points[:, 2] / voxel).astype(np.int64)
     far = (points if extent is None else extent)[:, :2].max(axis=0)
     width, height = (np.floor((far - corner) / cell).astype(int) + 1 + margin).tolist()
     flat = row * width + column
-    level -= level.min(initial=np.iinfo(level.dtype).max)  # there may be no point
+    level -= level.min(initial=np.iinfo(level.dtype).max)  # there may be no points
     size, levels = height * width, int(level.max(initial=0)) + 1
     number = flat * levels + level
     if means or size * levels > _DENSE * len(points):
@@ -321,7 +321,7 @@ def rasterise(
 
 
 class StationGrid:
-    """Look-up of stations by position.
+    """Grid that finds stations by position.
 
     Attributes:
         stations: (M, 3) float32 metres, in the map's frame.
@@ -341,14 +341,14 @@ class StationGrid:
         if (levels := int(count.max())) > _MAX_LEVELS:
             raise MapError(f"the map has {levels} stations above one another, {_MAX_LEVELS} at most; build it again")
         self._off = int(self._shape.prod())  # number of all cells off the grid
-        # (L, U + 1) stations of each level, lowest first, -1 for none, by cells that have any; the last is of others
+        # (L, U + 1) stations by level, lowest first, and occupied cell; -1 for none; the last column is for other cells
         self._levels = np.full((levels, len(unique) + 1), -1, dtype=np.int32)
         for level in range(levels):
             has = count > level
             self._levels[level, :-1][has] = order[first[has] + level]
         self._row = np.full(self._off + 1, len(unique), dtype=np.int32)
         self._row[unique] = np.arange(len(unique))
-        # of one level: its station at once, without a second look-up
+        # with a single level, the station of each cell, which saves a second look-up
         self._single = self._levels[0, self._row] if levels == 1 else None
 
     def __len__(self) -> int:
@@ -356,7 +356,7 @@ class StationGrid:
         return len(self.stations)
 
     def at(self, positions: Reals) -> Indices:
-        """Return the station (N,) at each of (N, 3) positions, of several the nearest within 2.5 m; -1 for none."""
+        """Return the station (N,) at each of (N, 3) positions, -1 for none; of several levels the nearest in 2.5 m."""
         cell = self.cell(positions)
         if self._single is not None:
             return np.asarray(self._single.take(cell), dtype=np.intp)
@@ -376,7 +376,7 @@ class StationGrid:
         return np.asarray(np.floor(self.stations[chosen, :2].astype(np.float64) / self.block), dtype=np.int64)
 
     def cell(self, positions: Reals) -> Indices:
-        """Return the number of the cell (N,) that holds each of (N, 2 or 3) positions; off the grid, the last."""
+        """Return the number of the cell (N,) at each of (N, 2 or 3) positions; off the grid, the last number."""
         index = np.floor(np.asarray(positions[:, :2], dtype=np.float64) * (1.0 / self.block)).astype(np.int64)
         index -= self._low
         inside = (index >= 0).all(axis=1) & (index < self._shape).all(axis=1)

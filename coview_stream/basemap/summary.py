@@ -1,4 +1,4 @@
-"""Facts about a map for people: its extent with warnings, its plan as a picture, and thinned points for viewers."""
+"""Facts about a map for people: extent and warnings, a plan drawn from above, and thinned points for viewers."""
 
 from __future__ import annotations
 
@@ -21,30 +21,30 @@ from coview_stream.geometry.arrays import Bools, Floats, Ints
 from coview_stream.geometry.rasters import cells
 from coview_stream.geometry.transforms import Points
 
-_CELL = 1.0  # metres: the area that a map covers is counted in such squares
+_CELL = 1.0  # metres: edge of the squares that count a map's area
 _SAMPLED = 100_000  # points
 _STRAY = 0.1  # per cent of the points at either end of the heights that may be birds or pits
 
 # Limits of the warnings, set by hand; they decide nothing. docs/results.md has the table of densities.
-_THIN = 8.0  # points per m2 of a survey: from 8 on real runs were found at once or as late as on the whole survey
-_LOW = 1.0  # metres: nothing that stands is lower
-_BARE = 0.02  # share of the squares on which something has to stand
-_FLAT_SHARE = 2.0  # times as many surfaces as face up face another way, where another axis is the vertical one
+_THIN = 8.0  # points per m2 of a survey: with more, real runs were found as early as on the whole survey
+_LOW = 1.0  # metres: least height of a standing object
+_BARE = 0.02  # least share of the squares with a standing object
+_FLAT_SHARE = 2.0  # an axis is taken for the vertical if this many times more surfaces face along it than along z
 _FACING = np.cos(np.radians(20.0))
-_HOLES = 0.15  # share of a station's surroundings that has to be surveyed, for half of the stations
+_HOLES = 0.15  # least surveyed share of a station's surroundings, for half of the stations
 
 _DRAWN_POINTS = 2_000_000
 _PIXELS = 800  # along the longer side
 _DARK, _LIGHT = 0.15, 0.9  # grey of the highest and of the lowest points
 _STRAY_HEIGHTS = 1.0  # per cent of the heights at either end that may be birds or pits
-POINTS_OF_FILE = 300_000  # of a view of a map on this machine
-POINTS_ON_WIRE = 100_000  # of a view from a node: 0.8 MB of JSON
-MAX_WIRE_BYTES = 4 * 1024 * 1024  # of the JSON of a view
-_MAX_POINTS = 500_000  # that are read
-_OVERSAMPLED = 8  # times as many points as asked for are thinned, evenly spread over the map
-_GROWTH = 1.2  # of the cells, until few enough are left
-_GROUND_BAND = 0.4  # metres above the ground's height: still the ground
-_GROUND_CELL = 4.0  # metres: of a survey without a map, in which the lowest point is the ground
+POINTS_OF_FILE = 300_000  # in a view of a map on this machine
+POINTS_ON_WIRE = 100_000  # in a view from a node: 0.8 MB of JSON
+MAX_WIRE_BYTES = 4 * 1024 * 1024  # of a view's JSON
+_MAX_POINTS = 500_000  # accepted in a view
+_OVERSAMPLED = 8  # thinning starts from this many times the requested points, evenly spread over the map
+_GROWTH = 1.2  # factor by which cells grow until few enough points are left
+_GROUND_BAND = 0.4  # metres above the ground height that are still ground
+_GROUND_CELL = 4.0  # metres: in a survey without a map, the lowest point of such a cell is ground
 _MAX_CRS = 8000  # letters
 _FINEST = 0.005  # metres: a step on the wire
 _MAX_COORDINATE = 1e8  # metres: no place on this planet
@@ -55,14 +55,14 @@ class MapSummary:
     """Size and content of a map.
 
     Attributes:
-        width: metres along x. depth: along y.
-        area: m2 that hold points, in squares of a metre.
-        lowest, highest: heights in the source's frame, metres, but for a few stray points.
-        density: points kept per m2 of that area: one of each voxel, so that strips and files that overlap count once.
+        width, depth: metres along x and y.
+        area: m2 that hold points, in one-metre squares.
+        lowest, highest: heights in the source's frame, metres, without a few stray points.
+        density: points kept per m2 of that area, one per voxel, so that overlapping strips and files count once.
         crs: name of the reference system; "unknown" if none is stated.
-        bytes: of all arrays, or of the tiles.
-        warnings: one sentence for each feature of the map that will make robots fail.
-        form: that has these bytes: one file, or tiles.
+        bytes: size of all arrays, or of the tiles.
+        warnings: one sentence for each feature of the map on which robots will fail.
+        form: form of the map with this size, one file or tiles.
     """
 
     width: float
@@ -77,7 +77,7 @@ class MapSummary:
     form: str = "one file"
 
     def __str__(self) -> str:
-        """Return one line; the size in feet too where no reference system states the unit."""
+        """Return one line, with the size also in feet if no reference system states the unit."""
         area = f"{self.area / 1e6:.2f} km2" if self.area >= 1e5 else f"{self.area:.0f} m2"
         width, depth = self.width * FOOT, self.depth * FOOT
         feet = f" ({width:.0f} x {depth:.0f} m if in feet: build --crs feet)" if self.crs == UNKNOWN else ""
@@ -132,9 +132,9 @@ def summary(base_map: SummarizedMap) -> MapSummary:
 
 
 def too_thin(density: float, voxel: float) -> str | None:
-    """Return a warning where fewer points per m2 were kept than of 8 spread at random (``voxel``: its edge, metres)."""
+    """Return a warning if fewer points per m2 were kept than 8 random ones would leave (``voxel``: edge, metres)."""
     area = voxel**2
-    if density >= (1.0 - math.exp(-_THIN * area)) / area:  # the share of squares that are hit
+    if density >= (1.0 - math.exp(-_THIN * area)) / area:  # share of the squares that are hit
         return None
     return (
         f"{density:.2g} points/m2 are few: on surveys of {_THIN:.0f} and less the first pose may come after 100 m of "
@@ -143,7 +143,7 @@ def too_thin(density: float, voxel: float) -> str | None:
 
 
 def _upright(base_map: SummarizedMap) -> str | None:
-    """Compare how many surfaces face each axis, and how far the points extend along it."""
+    """Return a warning if z is not up, judged by how many surfaces face each axis, and by the extent along it."""
     packed = base_map.arrays["normals"]
     normals = unit_normals(np.array(packed[:: max(1, -(-len(packed) // _SAMPLED))]))
     facing = (np.abs(normals) > _FACING).mean(axis=0)
@@ -159,7 +159,7 @@ def _upright(base_map: SummarizedMap) -> str | None:
 
 
 def _structured(points: Points, index: Ints, covered: Bools) -> str | None:
-    """Look for objects: squares of a metre whose points differ by a metre in height and more."""
+    """Return a warning if too few one-metre squares have points that differ by more than a metre in height."""
     size = len(covered)
     low, high = np.full(size, np.inf, np.float32), np.full(size, -np.inf, np.float32)
     np.minimum.at(low, index, points[:, 2])
@@ -174,7 +174,7 @@ def _structured(points: Points, index: Ints, covered: Bools) -> str | None:
 
 
 def _covered(base_map: SummarizedMap) -> str | None:
-    """Look at the surveyed share of the stations' surroundings."""
+    """Return a warning if too little of the stations' surroundings was surveyed."""
     radius, block = base_map.config.descriptor.radius, base_map.config.block
     survey = base_map.survey
     surveyed = np.asarray(survey.values, dtype=np.float64)
@@ -197,16 +197,16 @@ def draw_plan(sampled: Callable[[int], Points], origin: Floats, voxel: float, ax
     """Draw a map from above in the frame of its sources, metres, darker where it is higher; return the axes.
 
     Args:
-        sampled: returns at most so many of the map's points (N, 3).
-        origin: (3,) of these points, in the frame of the sources.
+        sampled: returns at most the given number of the map's points (N, 3).
+        origin: (3,) origin of these points, in the frame of the sources.
         voxel: metres between points.
-        axes: of matplotlib, to draw into; None makes a figure. DependencyError if matplotlib is missing.
+        axes: matplotlib axes to draw into; None makes a figure. DependencyError if matplotlib is missing.
     """
     if axes is None:
         axes = require_library("matplotlib.pyplot", "matplotlib>=3.8", "pictures of maps").figure().add_subplot()
     points = sampled(_DRAWN_POINTS)
     side = float(np.ptp(points[:, :2], axis=0).max())
-    # not finer than the pixels, nor than the points lie
+    # no finer than the pixels or the spacing of the points
     cell = max(side / _PIXELS, 1.5 * voxel)
     corner, (rows, columns), index = cells(points, cell)
     highest = np.full(rows * columns, -np.inf)
@@ -221,7 +221,7 @@ def draw_plan(sampled: Callable[[int], Points], origin: Floats, voxel: float, ax
     axes.set_aspect("equal")
     axes.set_xlabel("x [m]")
     axes.set_ylabel("y [m]")
-    axes.locator_params(axis="x", nbins=5)  # numbers of UTM are long
+    axes.locator_params(axis="x", nbins=5)  # UTM numbers are long
     axes.ticklabel_format(useOffset=False, style="plain")
     return axes
 
@@ -236,7 +236,7 @@ class MapView:
         is_ground: (N,) whether a point is on the ground.
         crs: coordinate reference system of the sources as text, None if unknown.
         sha256: hash of the map.
-        parts: of a joined map, in whose frames poses are; None for one map.
+        parts: parts of a joined map, whose frames poses are in; None for a single map.
     """
 
     origin: Floats
@@ -248,7 +248,7 @@ class MapView:
 
     @classmethod
     def of(cls, base_map: SummarizedMap, count: int = POINTS_OF_FILE) -> MapView:
-        """Thin a map's cloud to at most ``count`` points, one for each cell of a grid in space."""
+        """Thin a map's cloud to at most ``count`` points, one per cell of a 3-D grid."""
         points = base_map.sampled_points(_OVERSAMPLED * count)
         chosen = points[_thinned(points, count)]
         parts = MapParts.of(base_map.parameters)
@@ -256,7 +256,7 @@ class MapView:
 
     @classmethod
     def of_cloud(cls, points: Points, origin: Floats, count: int = POINTS_OF_FILE) -> MapView:
-        """Thin a survey without a map: (N, 3) float32 about ``origin``, metres.
+        """Thin a survey without a map: (N, 3) float32 relative to ``origin``, metres.
 
         Points near the lowest point of their cell count as ground.
         """
@@ -276,7 +276,7 @@ class MapView:
         return self.points.min(axis=0).astype(np.float64), self.points.max(axis=0).astype(np.float64)
 
     def to_json(self) -> dict[str, Any]:
-        """Plain data: points as base64 of little-endian int16 in ``step_m``, the ground's ``ground`` points first."""
+        """Plain data: points as base64 of little-endian int16 in ``step_m``, the ``ground`` ground points first."""
         order = np.argsort(~self.is_ground, kind="stable")
         low, high = self.bounds
         middle = np.round(0.5 * (low + high))
@@ -295,7 +295,7 @@ class MapView:
 
     @classmethod
     def from_json(cls, data: dict[str, Any]) -> MapView:
-        """Read untrusted data of :meth:`to_json`; MessageError names a field that is missing or invalid."""
+        """Read untrusted data of :meth:`to_json`; MessageError names a missing or invalid field."""
         count: Any = data.get("count")
         ground: Any = data.get("ground")
         for name, value in (("count", count), ("ground", ground)):
@@ -328,7 +328,7 @@ class MapView:
 
 
 def _thinned(points: Points, count: int) -> np.ndarray:
-    """Return numbers of at most ``count`` points: the first of each cell of a grid."""
+    """Return the numbers of at most ``count`` points: the first in each cell of a 3-D grid."""
     if len(points) <= count:
         return np.arange(len(points))
     low = points.min(axis=0)
@@ -344,12 +344,12 @@ def _thinned(points: Points, count: int) -> np.ndarray:
 
 
 def _is_ground(base_map: SummarizedMap, points: Points) -> Bools:
-    """Return which points (N, 3) lie on the ground: near the height of a station next to them."""
+    """Mask the points (N, 3) on the ground, near the height of a station next to them."""
     stations, block = base_map.stations, base_map.config.block
     if not len(stations) or not len(points):
         return np.zeros(len(points), dtype=bool)
     cells = np.floor(stations[:, :2] / block).astype(np.int64)
-    low = cells.min(axis=0) - 2  # a border without stations all around
+    low = cells.min(axis=0) - 2  # an empty border all around
     heights = np.full(cells.max(axis=0) + 3 - low, np.nan, dtype=np.float32)
     heights[tuple((cells - low).T)] = stations[:, 2]
     column, row = np.clip(np.floor(points[:, :2] / block).astype(np.int64) - low, 1, np.array(heights.shape) - 2).T

@@ -1,4 +1,4 @@
-"""Tiles of the map's cloud: sorted by them, so that a crop touches only the pages of its tiles."""
+"""Tiles of the map's cloud, which is sorted by tile so that a crop touches only the pages of its tiles."""
 
 from __future__ import annotations
 
@@ -17,19 +17,19 @@ Key = tuple[int, int]
 """Column and row of a tile."""
 
 _NORMAL_SCALE = 127.0
-_SHORTEST = 0.0625  # length of a kept normal: a shorter one would lose its direction, which would be off by 7 degrees
+_SHORTEST = 0.0625  # length of a kept normal: as int8, a shorter one would be off by more than 7 degrees
 
 
 def scaled_normals(normals: Points, planarity: Floats32) -> Points:
-    """Return unit normals (N, 3) as a map keeps them: as long as the planarity (N,) in [0, 1] of the points around."""
+    """Scale unit normals (N, 3) to the form in a map, by the planarity (N,) in [0, 1] of the points around."""
     return normals * np.maximum(planarity, np.float32(_SHORTEST))[:, None]
 
 
 def sort_by_tile(points: Points, normals: Points | Int8s, tile: float) -> tuple[Points, Int8s, Ints]:
-    """Return points (N, 3), normals (N, 3) of a length of at most one as int8, and the index (T, 4) of their tiles.
+    """Sort points (N, 3) and normals (N, 3) by tile; return them, normals as int8, and the tile index (T, 4).
 
     An index row is (column, row, begin, end): the tile covers ``[column, column + 1) * tile`` in x, likewise in y.
-    A normal of length 1 in int8 is off by less than 0.5 degrees; normals may be int8 already.
+    Normals have a length of at most one, or are int8 already. As int8, a unit normal is off by less than 0.5 degrees.
     """
     scale = 1.0 if normals.dtype == np.int8 else _NORMAL_SCALE
     packed: Int8s = np.rint(normals * np.float32(scale)).astype(np.int8)
@@ -38,7 +38,7 @@ def sort_by_tile(points: Points, normals: Points | Int8s, tile: float) -> tuple[
 
 
 def spans(index: Ints, tile: float, centre: Floats, radius: float) -> Ints:
-    """Return begin and end (S, 2) of the tiles that ``radius`` metres around ``centre`` touch."""
+    """Return begin and end (S, 2) of the tiles within ``radius`` metres of ``centre``."""
     low = np.floor((centre[:2] - radius) / tile)
     high = np.floor((centre[:2] + radius) / tile)
     return np.asarray(index[((index[:, :2] >= low) & (index[:, :2] <= high)).all(axis=1), 2:])
@@ -56,23 +56,23 @@ def crop(
 def points_near(
     points: npt.NDArray[Any], index: Ints, tile: float, centre: Floats, radius: float
 ) -> tuple[Points, list[slice], Bools]:
-    """Return the points of :func:`crop`, the stretches of its tiles, and which of their points these are."""
+    """Return the points of :func:`crop`, the stretches of its tiles, and the mask of these points in them."""
     stretches = [slice(int(begin), int(end)) for begin, end in spans(index, tile, centre, radius)]
     near = np.concatenate([np.empty((0, 3), np.float32), *(points[stretch] for stretch in stretches)])
     dx, dy = near[:, 0] - np.float64(centre[0]), near[:, 1] - np.float64(centre[1])
     inside = dx * dx + dy * dy < radius * radius
-    # compress: a boolean index of rows takes five times as long
+    # compress: indexing rows by a mask takes five times as long
     return near.compress(inside, axis=0), stretches, inside
 
 
 def cut_points(arrays: Mapping[str, npt.NDArray[Any]], tile: float, cut: kernels.Cut) -> kernels.Crop | None:
-    """Cut the points around a place out of a map's arrays, sorted for searching; None where there are none."""
+    """Cut the points around a place out of a map's arrays, sorted for searching; None if there are none."""
     stretches = spans(arrays["tile_index"], tile, np.array([cut.x, cut.y]), cut.radius)
     return kernels.crop_points(arrays["points"], arrays["normals"], stretches, cut)
 
 
 def unit_normals(packed: npt.NDArray[Any]) -> Points:
-    """Return the unit normals (N, 3) of those (N, 3) that a map keeps; zero stays zero."""
+    """Return unit normals (N, 3) for the scaled normals (N, 3) of a map; zero stays zero."""
     normals = packed.astype(np.float32)
     length = np.sqrt(np.einsum("ij,ij->i", normals, normals))
     normals /= np.maximum(length, np.float32(1.0))[:, None]

@@ -1,7 +1,7 @@
-"""Arrays in unnamed files, for arrays that are made piece by piece and should not fill the memory.
+"""Arrays in unnamed files, for arrays that are built piece by piece and should not fill the memory.
 
-The files are deleted when they are closed, or when the process ends in any way. Space is allocated before it is
-written: a full disk is an error, not a signal.
+The files vanish when they are closed, or when the process ends in any way. Space is allocated before it is written, so
+that a full disk is an error, not a signal.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ Array = npt.NDArray[Any]
 
 
 class ArrayFiles(MemoryArrays):
-    """Arrays by name, each in a file: made whole by :meth:`zeros`, or row by row by :meth:`append`."""
+    """Arrays by name, each in a file: allocated at once by :meth:`zeros`, or grown by :meth:`append`."""
 
     def __init__(self, folder: Path) -> None:
         super().__init__()
@@ -59,14 +59,14 @@ class ArrayFiles(MemoryArrays):
         return made
 
     def append(self, name: str, rows: Array) -> int:
-        """Append rows (N, ...) to an array, and return how many it had; MapError if there is no space."""
+        """Append rows (N, ...) to an array, and return its earlier length; MapError if there is no space."""
         file = self._files.get(name) or self._new(name, rows.dtype, (0, *rows.shape[1:]))
         kind, (before, *rest) = self._shapes[name]
         if kind != rows.dtype or tuple(rest) != rows.shape[1:]:
             raise ValueError(f"rows of {name} are {rows.dtype} {rows.shape[1:]}, not {kind} {tuple(rest)}")
         content = np.ascontiguousarray(rows).reshape(-1).view(np.uint8).data
         with self._room():
-            file.seek(before * kind.itemsize * math.prod(rest))  # not after the remains of a failure
+            file.seek(before * kind.itemsize * math.prod(rest))  # over the remains of a failed write
             while len(content):
                 content = content[file.write(content) :]
         self._shapes[name] = kind, (before + len(rows), *rest)

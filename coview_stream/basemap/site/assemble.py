@@ -1,6 +1,6 @@
 """Arrays of a map from the layers of a site's tiles.
 
-A tile is worked on with the points around it, also those of neighbours that are in the store but were not asked for.
+Each tile is processed with the points around it, including points of neighbours in the store that were not requested.
 """
 
 from __future__ import annotations
@@ -32,11 +32,11 @@ from coview_stream.geometry.transforms import Points
 
 log = logging.getLogger("coview_stream.maps")
 
-VERSION = 3  # of the arrays that are made of the same layers
+VERSION = 3  # of the arrays that are built from the same layers
 PARAMETER = "made_tiles"
-"""Parameter of a working file: for each tile its state, first station, stations, first row of the field, rows."""
+"""Parameter of a working file: each tile's state, first station, station count, first field row and row count."""
 
-_FIELD_MARGIN = 16.0  # metres around a tile that its field depends on: one tile of the field
+_FIELD_MARGIN = 16.0  # metres around a tile that affect its field: one tile of the field
 _PORTION = 8192  # stations described at a time: 60 MB of descriptors
 _LEARNED = ("local", "sigma", "tiles", "place", "place_at")
 
@@ -49,7 +49,7 @@ def assemble(
     keys: Collection[Key] | None = None,
     earlier: Callable[[Mapping[Key, str]], EarlierMap] | None = None,
 ) -> tuple[Arrays, dict[str, Any]]:
-    """Return the arrays of a map of some tiles of a site, or all, and its parameters; the arrays outlive ``into``.
+    """Return arrays and parameters of a map of a site, or of some of its tiles; the arrays outlive ``into``.
 
     ``earlier`` opens an earlier map, given the states of the tiles (:meth:`SiteTiles.states`).
 
@@ -72,7 +72,7 @@ def assemble(
         1 + max(numbers) - min(numbers) for numbers in zip(*((e.column, e.row) for e in entries), strict=True)
     )
     area = across * down * manifest.tile**2
-    if (most := MAX_AREA * min(1.0, (block / MapConfig.block) ** 2)) < area:  # as many cells
+    if (most := MAX_AREA * min(1.0, (block / MapConfig.block) ** 2)) < area:  # the same number of cells
         raise MapError(f"tiles in a rectangle of {area / 1e6:.0f} km2, {most / 1e6:.0f} at most: {TOO_LARGE}")
     if counted > StationCodes.MAX_STATIONS:
         raise MapError(f"{counted} stations, {StationCodes.MAX_STATIONS} at most: {TOO_LARGE}")
@@ -93,7 +93,7 @@ def assemble(
             raise MapError(f"{flaw}; fetch or build it again") from error
     parameters = dict(manifest.parameters) | {"crs": manifest.crs, "site": manifest.sha256, "learned": learned}
     if keys is not None and isinstance(read := parameters.get("source_points"), int):
-        # an estimate: the source points of single tiles are not known
+        # an estimate: source points are not counted per tile
         parameters["source_points"] = round(read * tiles.points / sum(tile.points for tile in manifest.tiles))
     table: list[list[Any]] = []
     first = row = 0
@@ -104,7 +104,7 @@ def assemble(
 
 
 def field_layers(arrays: Arrays, into: ArrayFiles) -> Arrays:
-    """Return the rasters in which a map's field is looked up, made in files; MapError if they are too large."""
+    """Return the layers of a map's field, built in files; MapError if they are too large."""
     try:
         made = layers_arrays(arrays, into.zeros, into.release)
     except ValueError as error:
@@ -114,12 +114,12 @@ def field_layers(arrays: Arrays, into: ArrayFiles) -> Arrays:
 
 
 class SiteTiles:
-    """Tiles of a site for :func:`~coview_stream.basemap.map_arrays.map_arrays`; their clouds lie in files.
+    """Tiles of a site for :func:`~coview_stream.basemap.map_arrays.map_arrays`, with their clouds in files.
 
     Attributes:
         config: settings of the map.
         stations: (M, 3) stations of each tile, relative to the origin.
-        grid: of the site.
+        grid: grid of the site.
     """
 
     def __init__(
@@ -161,11 +161,11 @@ class SiteTiles:
 
     @property
     def points(self) -> int:
-        """Number of points, without those of neighbours."""
+        """Number of points, excluding neighbours."""
         return sum(end - begin for begin, end in (self._spans[key] for key in self.stations))
 
     def cells(self, beside: bool) -> Ints:
-        """Return column and row (K, 2) of the blocks that hold points; ``beside``: also those of neighbours."""
+        """Return column and row (K, 2) of the blocks that hold points; with ``beside`` also blocks of neighbours."""
         return np.concatenate([self._cells[key] for key in (self._cells if beside else self.stations)])
 
     def index(self) -> Ints:
@@ -173,7 +173,7 @@ class SiteTiles:
         return np.concatenate(self._index[: len(self.stations)])
 
     def states(self, manifest: Manifest) -> dict[Key, str]:
-        """Return a hash of the settings, the stations of each tile, and the clouds on it and around it."""
+        """Return for each tile a hash of the settings, its stations, and the clouds on and around it."""
         settings = [VERSION, manifest.origin, manifest.tile, repr(self.config)]
         states = {}
         for entry in self._entries:
@@ -247,7 +247,7 @@ class SiteTiles:
 
 
 def layer_of(entry: TileEntry, name: str, store: TileStore, grid: SiteGrid) -> Arrays:
-    """Return the arrays of a tile's layer; MapError where it is missing, damaged, or larger than the entry says."""
+    """Return the arrays of a tile's layer; MapError if it is missing, damaged, or larger than the entry says."""
     layer = entry.layers[name]
     most = most_bytes(name, entry.points, entry.stations, grid.tile, grid.config.voxel)
     return decode(store.get(layer.sha256, layer.bytes), str(store.path(layer.sha256)), most)

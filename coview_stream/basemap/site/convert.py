@@ -1,8 +1,8 @@
 """Conversion of maps: one file to the tiles of a site, a site to one file, and light copies of sites.
 
-A light copy is for robots with little room or a slow link: it has no learned features, and of each cube of half a metre
-only the point nearest to the mean of those in it, rounded to four centimetres instead of two. Cubes are those of the
-likelihood field and of the voxels that descriptors count, for which the same cells stay occupied.
+A light copy is for robots with a small disk or a slow link. It has no learned features, and keeps in each cube of half
+a metre only the point nearest to the mean, rounded to four centimetres instead of two. The cubes are the cells of the
+likelihood field and the voxels that descriptors count, so the same cells stay occupied.
 """
 
 from __future__ import annotations
@@ -40,7 +40,7 @@ _LIGHT = "light"  # parameter of a manifest
 def split(arrays: Arrays, parameters: dict[str, Any], directory: Path, key: SigningKey | None = None) -> Manifest:
     """Write a map as a site into a directory that is new, empty or a site, signed if there is a key.
 
-    Its points are rounded to 2 cm, its normals to 2 degrees. MapError if the directory cannot be used.
+    Points are rounded to 2 cm, normals to 2 degrees. MapError if the directory cannot be used.
     """
     check_directory(directory)
     grid = SiteGrid((0.0, 0.0, 0.0), TILE, config_of_map(parameters["config"]))
@@ -75,7 +75,7 @@ def join(directory: Path, path: Path, key: SigningKey | None = None, progress: P
 
 
 def lighten(source: Path, target: Path, key: SigningKey | None = None, progress: Progress | None = None) -> Manifest:
-    """Write a light copy of a site into a directory that is new, empty or one, and return its manifest.
+    """Write a light copy of a site into a directory that is new, empty or a light copy, and return its manifest.
 
     MapError if a layer is missing or damaged, or the target cannot be used. ``progress`` counts tiles.
     """
@@ -94,7 +94,7 @@ def lighten(source: Path, target: Path, key: SigningKey | None = None, progress:
     store, light_store, entries = TileStore(source), TileStore(target), []
     voxel, step = grid.config.voxel, 2.0 * grid.config.voxel / STEPS
     for done, entry in enumerate(manifest.tiles, start=1):
-        # about the tile's corner, which lies on the cubes
+        # relative to the tile's corner, which is a corner of a cube
         points, packed = read_cloud_layer(layer_of(entry, "cloud", store, grid), np.zeros(3), grid.tile, voxel)
         chosen = one_of_each_cube(points)
         rounded = ((np.floor(points[chosen].astype(np.float64) / step) + 0.5) * step).astype(np.float32)
@@ -134,7 +134,7 @@ def _features(arrays: Arrays, key: Key) -> Arrays:
 
 
 def one_of_each_cube(points: Points, cube: float = CUBE) -> Ints:
-    """Return the numbers (K,), ascending, of one point of (N, 3) in each cube: the nearest to their mean."""
+    """Return the numbers (K,), ascending, of the point of (N, 3) nearest to the mean in each cube."""
     cells = np.floor(points.astype(np.float64) / cube).astype(np.int64)
     cells -= cells.min(axis=0, initial=0)
     shape = cells.max(axis=0, initial=0) + 1

@@ -1,6 +1,6 @@
-"""Executors of a build's steps: in this process, in processes on this machine, or on a Dask scheduler.
+"""Executors of a build's steps: in this process, in other processes of this machine, or on a Dask scheduler.
 
-All give the same results: a step is a pure function of its arguments and of files that no other step changes.
+All give the same results, as a step is a pure function of its arguments and of files that no other step changes.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ _ONE_THREAD = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
 
 
 class Executor:
-    """Runner of one function for many items, here in this process."""
+    """Runner of one function for many items, in this process."""
 
     def run(
         self, function: Callable[[Item], Result], items: Sequence[Item]
@@ -41,15 +41,10 @@ class Executor:
 
 
 class ProcessExecutor(Executor):
-    """Executor in processes of this machine, each with one thread for its libraries.
+    """Executor in ``workers`` processes of this machine, each with one thread for its libraries.
 
     After a process has died, its items run again one at a time; the item that kills its process gets an error.
-
-    Args:
-        workers: number of processes.
-
-    Raises:
-        ConfigError: the number is out of range.
+    ConfigError if the number is out of range.
     """
 
     def __init__(self, workers: int) -> None:
@@ -75,7 +70,7 @@ class ProcessExecutor(Executor):
                         suspects.append(futures[future])
                     except Exception as error:
                         yield futures[future], error
-            except BaseException:  # KeyboardInterrupt: the results are not used
+            except BaseException:  # also KeyboardInterrupt: nobody uses the results
                 self._pool = None
                 _terminate(pool)
                 raise
@@ -95,7 +90,7 @@ class ProcessExecutor(Executor):
             return MapError("its process died (killed, or out of memory?); fewer --workers take less")
         except Exception as error:
             return error
-        finally:  # it has nothing more to do, or KeyboardInterrupt
+        finally:  # also after KeyboardInterrupt
             _terminate(pool)
 
     def close(self) -> None:
@@ -114,7 +109,7 @@ class DaskExecutor(Executor):
 
     Args:
         address: ``HOST:PORT`` or ``tcp://HOST:PORT`` of a scheduler; ``local`` starts a cluster on this machine.
-        workers: of a local cluster; None lets Dask choose.
+        workers: number in a local cluster; None lets Dask choose.
 
     Raises:
         DependencyError: no ``distributed``. ConfigError: the scheduler cannot be reached.
@@ -166,7 +161,7 @@ def _terminate(pool: ProcessPoolExecutor) -> None:
 
 @contextmanager
 def _deaf_to_interrupts() -> Iterator[None]:
-    """Start processes that no Ctrl-C at the terminal reaches: this one ends them; it is interrupted afterwards."""
+    """Start processes that ignore Ctrl-C at the terminal: this process ends them when it is interrupted afterwards."""
     if not hasattr(signal, "pthread_sigmask"):  # Windows
         yield
         return
@@ -179,7 +174,7 @@ def _deaf_to_interrupts() -> Iterator[None]:
 
 @contextmanager
 def _one_thread() -> Iterator[None]:
-    """Start processes with one thread each meanwhile: the workers run in parallel already."""
+    """Start processes with one thread each, as the workers run in parallel already."""
     before = {name: os.environ.get(name) for name in _ONE_THREAD}
     os.environ.update(dict.fromkeys(_ONE_THREAD, "1"))
     try:

@@ -1,4 +1,4 @@
-"""Sources of sites elsewhere (web server, object store, network disk), and mirrors of them in the cache."""
+"""Remote sources of sites (web server, object store, network disk), and their mirrors in the cache."""
 
 from __future__ import annotations
 
@@ -34,10 +34,10 @@ from coview_stream.clouds.progress import Progress
 from coview_stream.errors import CloudError, CoViewError, MapError, TransportError, require_library, warn
 
 _PIECE = 1 << 20
-_PATIENCE, _SLOWEST = 30.0, 10_000.0  # seconds that an answer may take, and bytes per second of one that takes longer
+_PATIENCE, _SLOWEST = 30.0, 10_000.0  # seconds an answer may take, least bytes per second of one that takes longer
 
 log = logging.getLogger("coview_stream.maps")
-_TRIES, _WAIT = 3, 0.5  # of a layer; seconds before the second try
+_TRIES, _WAIT = 3, 0.5  # tries for a layer, seconds before the second
 
 
 class SiteSource(Protocol):
@@ -64,7 +64,7 @@ class WebSource(SiteSource):
         self._known: tuple[str, bytes] | None = None
 
     def manifest(self) -> bytes:
-        """Return the manifest's bytes; the server sends them again only if they have changed."""
+        """Return the manifest's bytes, which the server sends again only if they have changed."""
         headers = {} if self._known is None else {"If-None-Match": self._known[0]}
         try:
             answer = open_web_file(urllib.request.Request(f"{self.name}/{FILE}", headers=headers))
@@ -133,7 +133,7 @@ def is_site_address(name: object) -> bool:
 
 
 def _body(answer: Any, limit: int, address: str) -> bytes:
-    """Return the body of an answer, at most ``limit`` + 1 bytes; TransportError if it is cut off, or drips."""
+    """Return the body of an answer, at most ``limit`` + 1 bytes; TransportError if it is cut off or too slow."""
     raw, begin = bytearray(), time.monotonic()
     promised = answer.length
     wanted = limit + 1 if promised is None else min(limit + 1, promised)
@@ -150,44 +150,44 @@ def _body(answer: Any, limit: int, address: str) -> bytes:
 
 
 class Mirror:
-    """Cached copy of a site, whole or in part; maps are opened from it, with or without a network.
+    """Cached copy of a site or of a part, from which maps are opened with or without a network.
 
-    Layers are compared with their hashes before they are written, the manifest with its signature if there is a key.
-    The manifest is written last: the mirror always holds one state of the site, and the last one that was opened.
+    Layers are compared with their hashes before they are written, and the manifest with its signature if there is a
+    key. The manifest is written last, so the mirror always holds one whole state, and the last one that was opened.
 
     Attributes:
-        source: of the site.
-        directory: of the mirror, itself a site.
-        around: circle of the tiles that are fetched; None fetches all.
-        offline: reason why the source could not be used the last time, else empty.
+        source: source of the site.
+        directory: directory of the mirror, itself a site.
+        around: circle whose tiles are fetched; None fetches all.
+        offline: why the source could not be used the last time, else empty.
     """
 
     def __init__(self, source: SiteSource, verify_key: VerifyKey | None = None, around: Around | None = None) -> None:
-        # the source is not asked yet
+        # does not contact the source yet
         self.source = source
         self.around = around
         self.offline = ""
         self._verify_key = verify_key
-        self._known: tuple[bytes, Manifest] | None = None  # newest manifest that was read, by the hash of its bytes
+        self._known: tuple[bytes, Manifest] | None = None  # newest manifest read, and the hash of its bytes
         name = hashlib.sha256(source.name.encode()).hexdigest()[:32]
         self.directory = cache_folder() / "sites" / name
         self._store = TileStore(self.directory)
 
     @property
     def map_path(self) -> Path:
-        """Path of the map: the mirror, or the part of it in the circle."""
+        """Path of the map: the mirror, or its part in the circle."""
         if self.around is None:
             return self.directory
         keys = Manifest.load(self.directory).tiles_around(self.around)
         return part_file(self.directory, keys, str(self.around))
 
     def open(self, progress: Progress | None = None) -> Path:
-        """Bring the mirror up to date, or keep a good cached copy, with a warning; return :attr:`map_path`.
+        """Update the mirror, or keep a good cached copy with a warning; return :attr:`map_path`.
 
         Raises:
-            TransportError: the source cannot be reached, and nothing is in the cache.
-            MapError: the source gave no site, damaged layers, or a manifest that is not signed with the key, and
-                neither is a whole and signed copy in the cache.
+            TransportError: the source cannot be reached, and the cache is empty.
+            MapError: the source gave no site, damaged layers, or a manifest that is not signed with the key, and the
+                cache has no whole copy with a valid signature.
         """
         try:
             self.refresh(progress, check=True)
@@ -208,7 +208,7 @@ class Mirror:
         return self.map_path
 
     def _wanted(self, manifest: Manifest) -> dict[str, tuple[LayerEntry, TileEntry]]:
-        """Return the layers of the tiles in the circle, and the tile of each, by hash."""
+        """Return, by hash, the layers of the tiles in the circle, each with its tile."""
         keys = None if self.around is None else manifest.tiles_around(self.around)
         return {
             layer.sha256: (layer, tile)
@@ -218,14 +218,14 @@ class Mirror:
         }
 
     def _read(self, raw: bytes, name: str) -> Manifest:
-        """Read a manifest, unless it has the bytes of the newest one; errors as of :meth:`Manifest.from_bytes`."""
+        """Read a manifest, unless its bytes are those read last; errors as in :meth:`Manifest.from_bytes`."""
         digest = hashlib.sha256(raw).digest()
         if self._known is None or self._known[0] != digest:
             self._known = digest, Manifest.from_bytes(raw, name, self._verify_key)
         return self._known[1]
 
     def _asked(self, ask: Callable[[], bytes]) -> bytes:
-        """Return an answer of the source; TransportError for any failure."""
+        """Return the source's answer; TransportError for any failure."""
         try:
             return ask()
         except CoViewError:
@@ -234,13 +234,13 @@ class Mirror:
             raise TransportError(f"{self.source.name}: {type(error).__name__}: {_reason(error)}") from error
 
     def refresh(self, progress: Progress | None = None, check: bool = False) -> bool:
-        """Ask the source, fetch missing layers, and return whether the site has changed; errors as of :meth:`open`.
+        """Ask the source, fetch missing layers, and return whether the site has changed; errors as in :meth:`open`.
 
         ``progress`` counts bytes. ``check`` compares existing layers with their hashes, not only with their lengths.
         """
         self.offline = ""
         with contextlib.suppress(OSError):
-            os.utime(self.directory)  # recently used: the cache keeps it
+            os.utime(self.directory)  # marks it as recently used, for the cache
         raw = self._asked(self.source.manifest)
         manifest = self._read(raw, f"{self.source.name}/{FILE}")
         local, before = b"", None
@@ -248,7 +248,7 @@ class Mirror:
             local = read_manifest(self.directory)
             before = self._read(local, str(self.directory))
         wanted = self._wanted(manifest)
-        if (size := sum(layer.bytes for layer, _ in wanted.values())) > cache_bound():  # a wrong manifest's too
+        if (size := sum(layer.bytes for layer, _ in wanted.values())) > cache_bound():  # also wrong sizes
             raise MapError(
                 f"{self.source.name}: its tiles are {size / 1e9:.1f} GB, more than the cache may hold; open a part of "
                 "it (--around X,Y,RADIUS), or set COVIEW_CACHE_GB"
@@ -279,7 +279,7 @@ class Mirror:
             self.directory.mkdir(parents=True, exist_ok=True)
             write_manifest(self.directory, raw)
             self._known = hashlib.sha256(raw).digest(), manifest
-        if changed and before is not None:  # a process may still use the state before
+        if changed and before is not None:  # a process may still use the earlier state
             with contextlib.suppress(MapError):  # none was opened
                 opened = Manifest.load(self.directory, OPENED).hashes()
             self._store.prune(manifest.hashes() | before.hashes() | opened)

@@ -1,14 +1,14 @@
-"""Layers of a tile: their arrays, and their bytes.
+"""Layers of a tile: their arrays and their encoding.
 
-Bytes: ``COVIEWL1``, the header's length (4 bytes, little endian), a JSON header, and the arrays in its order, each
-compressed by bzip2 or, where the header states nothing, by LZMA of byte planes. bzip2 makes clouds as small as LZMA
-in a seventh of the time, but features a tenth larger. Readers bound all sizes before they allocate.
+A layer is ``COVIEWL1``, the header's length (4 bytes, little-endian), a JSON header, and the arrays in its order, each
+compressed by bzip2 or, where the header names no packing, by LZMA of byte planes. bzip2 compresses clouds as well as
+LZMA in a seventh of the time, but features end up a tenth larger. Readers bound all sizes before they allocate.
 
-Layer ``cloud``: points sorted by voxel (row, column, height), 2.5 bytes each. Stored are the points of each column, the
-steps of height between them, their position in the voxel in steps of ``voxel / STEPS`` (2 cm of 0.25 m), the planarity,
-and the normals, which point up, by the octahedral map (Meyer et al., 2010) in 64 x 64 cells, within 2.3 degrees.
+The layer ``cloud`` has points sorted by voxel (row, column, height), 2.5 bytes each. It stores the number of points in
+each column, the height steps between them, positions in the voxel in steps of ``voxel / STEPS`` (2 cm for 0.25 m), the
+planarity, and upward normals by the octahedral map (Meyer et al., 2010) in 64 x 64 cells, within 2.3 degrees.
 
-Layer ``stations``: the blocks with stations, and the heights to the centimetre.
+The layer ``stations`` has the blocks with stations, and the heights to the centimetre.
 """
 
 from __future__ import annotations
@@ -35,23 +35,23 @@ _TYPES = {"u1": "|u1", "i1": "|i1", "u2": "<u2", "i2": "<i2", "i4": "<i4", "f4":
 _MAX_HEADER = 1 << 16  # bytes
 _MAX_ARRAYS = 32
 _MAX_BYTES = 1 << 29  # of a layer in memory: ten times the densest tile
-# no contexts: neighbouring bytes of these small numbers predict little of each other
+# no contexts: neighbouring bytes of these small numbers hardly predict each other
 _FILTERS = [{"id": lzma.FILTER_LZMA2, "preset": 6, "lc": 0, "lp": 0, "pb": 0, "dict_size": 1 << 22}]
 PACKING: Mapping[str, Packing] = {"cloud": "bz2", "stations": "bz2", "features": "lzma"}
-STEPS = 12  # of a voxel's edge
-_CELLS = 64  # of the octahedral map, along each edge
+STEPS = 12  # per voxel edge
+_CELLS = 64  # along each edge of the octahedral map
 _PLANARITY = 15  # steps
 _MAX_LEVEL = 30_000  # voxels above or below zero
 _MAX_COLUMNS = 1 << 24
-_PER_COLUMN = 16  # points of a column of voxels in the mean: nothing is as dense as a wall of 4 m everywhere
+_PER_COLUMN = 16  # greatest mean number of points in a column of voxels: a wall of 4 m in every column
 _POINT, _STATION = 10, 12  # bytes of each in the arrays of a layer
-_ROWS = 1 << 18  # points that are unpacked at a time
+_ROWS = 1 << 18  # points unpacked at a time
 Layer = dict[str, npt.NDArray[Any]]
 _MAX_BLOCK = 1 << 26  # blocks from the origin: 100,000 km
 
 
 def encode(arrays: LayerArrays, packing: Packing = "bz2") -> bytes:
-    """Return the bytes of arrays of small integers or float32; the same arrays give the same bytes."""
+    """Encode arrays of small integers or float32; the same arrays give the same bytes."""
     entries: list[dict[str, Any]] = []
     parts = []
     for name in sorted(arrays):
@@ -62,7 +62,7 @@ def encode(arrays: LayerArrays, packing: Packing = "bz2") -> bytes:
             part = bz2.compress(array.tobytes())
             entry["packing"] = packing
         else:
-            # byte planes: the higher bytes of small numbers are alike
+            # byte planes: the high bytes of small numbers are alike
             planes = array.reshape(-1, 1).view(np.uint8).reshape(array.size, array.itemsize).T.tobytes()
             part = lzma.compress(planes, format=lzma.FORMAT_RAW, filters=_FILTERS)
         entries.append(entry | {"bytes": len(part)})
@@ -72,20 +72,20 @@ def encode(arrays: LayerArrays, packing: Packing = "bz2") -> bytes:
 
 
 def most_points(tile: float, cell: float) -> int:
-    """Return the greatest number of points in voxels, or of stations in blocks, of a tile's count."""
+    """Return the greatest plausible number of points (``cell``: the voxel) or stations (the block) of a tile."""
     return _PER_COLUMN * columns_of(tile, cell) ** 2
 
 
 def most_bytes(layer: str, points: int, stations: int, tile: float, voxel: float) -> int:
-    """Return the bytes that a tile's layer may unpack to."""
+    """Return the largest unpacked size of a tile's layer, bytes."""
     of = {"cloud": 2 * columns_of(tile, voxel) ** 2 + _POINT * points, "stations": _STATION * stations}
     return of.get(layer, _MAX_BYTES)
 
 
 def decode(raw: bytes, name: str, most: int = _MAX_BYTES) -> dict[str, npt.NDArray[Any]]:
-    """Return the arrays, read-only, of untrusted bytes of :func:`encode`.
+    """Decode untrusted bytes of :func:`encode` to read-only arrays.
 
-    MapError, with the layer's ``name``, if they are none, or unpack to more than ``most`` bytes.
+    MapError, with the layer's ``name``, if they are invalid or unpack to more than ``most`` bytes.
     """
     try:
         size = int.from_bytes(raw[8:12], "little")
@@ -126,9 +126,9 @@ def _unpacked(part: bytes, packing: object, wanted: int, itemsize: int) -> npt.N
 
 
 def cloud_layer(points: Points, normals: Points, planarity: Floats32, tile: float, voxel: float) -> Layer:
-    """Return the arrays of a tile's cloud; ``tile`` and ``voxel`` are metres.
+    """Return the arrays of a tile's cloud; ``tile`` and ``voxel`` are edges in metres.
 
-    Points (N, 3) are float32 metres about the tile's lower corner, in [0, tile) in x and y; unit normals (N, 3) do not
+    Points (N, 3) are float32 metres from the tile's lower corner, in [0, tile) in x and y; unit normals (N, 3) do not
     point down; planarity (N,) is in [0, 1].
     """
     across = columns_of(tile, voxel)
@@ -139,7 +139,7 @@ def cloud_layer(points: Points, normals: Points, planarity: Floats32, tile: floa
     cell = cell[order]
     inside = points[order].astype(np.float64) / voxel - cell
     counts = np.bincount(cell[:, 1] * across + cell[:, 0], minlength=across * across)
-    # the upper half of the octahedron is a turned square
+    # the upper half of the octahedron maps to a square turned by 45 degrees
     normals = normals[order]
     length = np.abs(normals).sum(axis=1, dtype=np.float64)
     x, y = (normals[:, :2] / np.maximum(length, 1e-9)[:, None]).T
@@ -154,7 +154,7 @@ def cloud_layer(points: Points, normals: Points, planarity: Floats32, tile: floa
 
 
 def read_cloud_layer(layer: Layer, corner: Floats, tile: float, voxel: float) -> tuple[Points, Int8s]:
-    """Return a tile's points (N, 3) float32, and int8 normals (N, 3) as long as the planarity.
+    """Return a tile's points (N, 3) float32, and int8 normals (N, 3) scaled by the planarity.
 
     ``corner`` (3,) is the tile's lower corner in the map's frame, metres. MapError if the untrusted arrays are
     inconsistent.
@@ -191,13 +191,13 @@ def read_cloud_layer(layer: Layer, corner: Floats, tile: float, voxel: float) ->
 
 
 def square_metres(points: Points) -> int:
-    """Return the number of squares of a metre that hold points (N, 3)."""
+    """Return the number of one-metre squares that hold points (N, 3)."""
     column, row = np.floor(points[:, :2]).astype(np.int64).T
     return len(np.unique(column * (1 << 32) + row))
 
 
 def columns_of(tile: float, voxel: float) -> int:
-    """Return the number of voxels along a tile's edge; MapError if too many, or none."""
+    """Return the number of voxels along a tile's edge; MapError if there are none or too many."""
     across = int(np.ceil(tile / voxel - 1e-6)) if voxel > 0 else 0
     if not 0 < across * across <= _MAX_COLUMNS:
         raise MapError(f"tiles of {tile:g} m in voxels of {voxel:g} m: choose smaller tiles or larger voxels")

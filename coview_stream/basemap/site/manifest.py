@@ -1,8 +1,8 @@
-"""Manifest of a site: settings, and tiles by the hashes of their layers.
+"""Manifest of a site, the JSON file ``manifest.json``: settings, and the tiles with the hashes of their layers.
 
-The manifest is a JSON file, ``manifest.json``. Its hash identifies the state of the whole site; a signature (ed25519)
-covers every byte of the layers. Readers verify it before they read anything, then check all numbers and names, tile by
-tile: another thread never waits longer than for one tile, and a refused manifest has taken no memory.
+Its hash identifies the state of the whole site; its signature (ed25519) covers every byte of the layers. Readers verify
+the signature before they read anything else, then check all numbers and names tile by tile, so that another thread
+waits for one tile at most and a refused manifest takes no memory.
 """
 
 from __future__ import annotations
@@ -27,16 +27,16 @@ from coview_stream.config import config_of_map
 from coview_stream.errors import ConfigError, MapError
 
 FORMAT = "coview-site"
-VERSION = 2  # is written; sites of version 1, with layers compressed otherwise, can be read
+VERSION = 2  # written; version 1, whose layers are compressed differently, can be read
 FILE = "manifest.json"
-OPENED = "opened.json"  # in a mirror: the last manifest that a map was opened from
+OPENED = "opened.json"  # in a mirror: the last manifest from which a map was opened
 LAYERS = ("cloud", "stations", "features")  # of a tile; features are optional
 MAX_MANIFEST = 1 << 24  # bytes: 35,000 tiles, of which 5,300 can be opened as one map
 MAX_LAYER = 1 << 28  # bytes
-_MAX_HEAD = 1 << 21  # bytes of all but the tiles: 18,000 sources
-_MAX_TAIL = 64  # bytes behind the tiles: the version
-_MAX_ENTRY = 2048  # bytes of a tile, which has 450
-_MOST_PACKED = 4  # points in a byte of a cloud: ten times as many as positions that are measured can be packed to
+_MAX_HEAD = 1 << 21  # bytes before the tiles: 18,000 sources
+_MAX_TAIL = 64  # bytes after the tiles: the version
+_MAX_ENTRY = 2048  # bytes of a tile; usual are 450
+_MOST_PACKED = 4  # points per byte of a cloud layer: ten times the density at which measured positions can be packed
 _MAX_OVERHEAD = 1 << 17  # bytes of a layer besides its arrays
 _MAX_INDEX = 1 << 20  # columns or rows from the origin
 _MAX_METRES = 1e8
@@ -47,7 +47,7 @@ _BEGIN = re.compile(rb'(?:, "signature": "([0-9a-f]*)", "signer": "([0-9a-f]*)")
 
 @dataclass(frozen=True)
 class LayerEntry:
-    """One layer of a tile: hash and number of its bytes."""
+    """One layer of a tile: the hash and the number of its bytes."""
 
     sha256: str
     bytes: int
@@ -59,11 +59,11 @@ class TileEntry:
 
     Attributes:
         column, row: it covers ``[column, column + 1) * tile`` metres in x, likewise in y, from the site's origin.
-        points: in its cloud.
-        stations: on it.
-        area: number of squares of a metre that hold points.
+        points: number of points in its cloud.
+        stations: number of stations.
+        area: number of one-metre squares that hold points.
         low, high: heights of the lowest and the highest point, metres from the origin.
-        layers: by name.
+        layers: layers by name.
     """
 
     column: int
@@ -91,23 +91,23 @@ class TileEntry:
 
     @property
     def nbytes(self) -> int:
-        """Bytes of its layers."""
+        """Size of its layers, bytes."""
         return sum(layer.bytes for layer in self.layers.values())
 
 
 @dataclass(frozen=True)
 class Manifest:
-    """A site.
+    """Manifest of a site.
 
     Attributes:
         origin: (3,) metres, in the frame of the sources; zero of all other coordinates.
         tile: edge of a tile, metres.
         crs: reference system of the sources, None if they state none.
-        parameters: of the build: ``config``, ``sources`` and others, as in a map file.
-        tiles: by row and column.
+        parameters: parameters of the build: ``config``, ``sources`` and others, as in a map file.
+        tiles: tiles sorted by row and column.
         signer: fingerprint of the signing key; empty if unsigned.
         signature: hexadecimal; empty if unsigned.
-        version: of the format.
+        version: format version.
     """
 
     origin: tuple[float, float, float]
@@ -126,7 +126,7 @@ class Manifest:
 
     @property
     def nbytes(self) -> int:
-        """Bytes of all layers."""
+        """Size of all layers, bytes."""
         return sum(tile.nbytes for tile in self.tiles)
 
     def hashes(self) -> set[str]:
@@ -134,7 +134,7 @@ class Manifest:
         return {layer.sha256 for tile in self.tiles for layer in tile.layers.values()}
 
     def tiles_around(self, around: Around) -> set[Key]:
-        """Return the tiles that touch a circle; MapError, with the distance of the nearest one, if there are none."""
+        """Return the tiles that touch a circle; MapError, with the distance of the nearest tile, if there are none."""
         x, y = around.x - self.origin[0], around.y - self.origin[1]
         distances = {}
         for entry in self.tiles:
@@ -150,7 +150,7 @@ class Manifest:
         return near
 
     def _pieces(self, joint: str = ", ", line: str = "") -> Iterator[bytes]:
-        """Yield all but the signature as JSON: ``joint`` joins tiles, ``line`` is before each and after the last."""
+        """Yield all but the signature as JSON; ``joint`` joins tiles, ``line`` precedes each and follows the last."""
         plain = {item.name: getattr(self, item.name) for item in fields(self)}
         del plain["signer"], plain["signature"]
         head = json.dumps({"format": FORMAT} | plain | {"tiles": []}, sort_keys=True, allow_nan=False)
@@ -177,10 +177,10 @@ class Manifest:
 
     @classmethod
     def from_bytes(cls, raw: bytes, name: str, key: VerifyKey | None = None) -> Manifest:
-        """Read untrusted bytes of :meth:`to_bytes`, or of earlier versions, which indented all.
+        """Read untrusted bytes of :meth:`to_bytes`, or of earlier versions, which were indented.
 
-        MapError if they are no manifest, or of an unknown version; or not signed with the key, if there is one, which
-        is seen to first.
+        Checks the signature first if there is a key. MapError if it is wrong or missing, if the bytes are no manifest,
+        or if their version is unknown.
         """
         try:
             if len(raw) > MAX_MANIFEST:
@@ -209,7 +209,7 @@ class Manifest:
             if not 1.0 <= tile <= 10_000.0 or not isinstance(crs, str | None) or not isinstance(parameters, dict):
                 raise ValueError("tile, crs or parameters are invalid")
             _check_depth(parameters, _MAX_DEPTH)
-            json.dumps([crs, parameters], ensure_ascii=False).encode()  # no half of a surrogate pair: can be printed
+            json.dumps([crs, parameters], ensure_ascii=False).encode()  # refuse lone surrogates: they cannot be printed
             grid = SiteGrid((0.0, 0.0, 0.0), tile, config_of_map(parameters["config"]))
             if len({(entry.column, entry.row) for entry in tiles}) != len(tiles):
                 raise ValueError("a tile is named twice")
@@ -225,7 +225,7 @@ class Manifest:
                     raise ValueError(f"a tile's {entry.points} points are in {entry.layers['cloud'].bytes} bytes")
             signed = signer.decode(), signature.decode()
             manifest = cls(origin, tile, crs, parameters, tuple(tiles), *signed, int(data["version"]))
-            _ = manifest.sha256  # can be written again
+            _ = manifest.sha256  # fails if it cannot be serialised
             return manifest
         except MapError:
             raise
@@ -242,12 +242,12 @@ class Manifest:
             raise MapError(f"{name}: cannot be read as a manifest ({reason}); fetch or build the site again") from error
 
     def save(self, directory: Path, name: str = FILE) -> None:
-        """Write it into a site's directory, complete or not at all; MapError if it cannot be written."""
+        """Write the manifest atomically into a site's directory; MapError if that fails."""
         write_manifest(directory, self.to_bytes(), name)
 
     @classmethod
     def load(cls, directory: Path, name: str = FILE, key: VerifyKey | None = None) -> Manifest:
-        """Read the manifest of a site's directory; MapError as of :meth:`from_bytes`, or if it is missing."""
+        """Read the manifest of a site's directory; MapError as in :meth:`from_bytes`, or if it is missing."""
         return cls.from_bytes(read_manifest(directory, name), str(directory / name), key)
 
 
@@ -264,7 +264,7 @@ def read_manifest(directory: Path, name: str = FILE) -> bytes:
 
 
 def write_manifest(directory: Path, raw: bytes, name: str = FILE) -> None:
-    """Write the bytes of a manifest into a site's directory, complete or not at all; MapError if that fails."""
+    """Write the bytes of a manifest atomically into a site's directory; MapError if that fails."""
     try:
         with atomic_file(directory / name, sync=True) as file:
             file.write(raw)
@@ -277,13 +277,13 @@ def _loads(text: bytes) -> Any:
 
 
 def _in_one_line(raw: bytes) -> bytes:
-    """Return JSON of several lines as json.dumps writes it in one; its strings hold no line ends."""
+    """Join JSON of several lines to the one line of json.dumps; JSON strings hold no line ends."""
     lines = (line.strip(b" \r\n") for line in io.BytesIO(raw))
     return b"".join(line + b" " if line.endswith(b",") else line for line in lines)
 
 
 def _refuse_other(content: bytes, name: str) -> NoReturn:
-    """Raise the MapError of bytes that list no tiles."""
+    """Raise the MapError for bytes that list no tiles."""
     if f'"format": "{FORMAT}"'.encode() in content[:_MAX_HEAD]:
         raise ValueError("it lists no tiles as 'build' writes them")
     raise MapError(f"{name}: is no manifest of a site; name the directory that 'build -o DIRECTORY/' made")
@@ -303,7 +303,7 @@ def _check_signature(content: bytes, signature: bytes, signer: bytes, key: Verif
 
 
 def _tiles_of(content: bytes, at: int) -> tuple[list[TileEntry], int]:
-    """Return the tiles that are listed from a place on, and where their list ends; ValueError if they are none."""
+    """Return the tiles listed from byte ``at`` on, and the end of their list; ValueError if they are invalid."""
     decoder, tiles = json.JSONDecoder(parse_float=_finite, parse_constant=_finite), []
     more = content[at : at + 1] != b"]"
     while more:
@@ -323,7 +323,7 @@ def is_site(path: Path) -> bool:
 
 
 def in_order(tiles: Iterable[TileEntry]) -> tuple[TileEntry, ...]:
-    """Return tiles by row and column."""
+    """Return tiles sorted by row and column."""
     return tuple(sorted(tiles, key=lambda tile: (tile.row, tile.column)))
 
 

@@ -1,6 +1,6 @@
-"""Building of a site out of core: sources to parts, parts to thinned tiles, tiles to layers, and a manifest.
+"""Build a site out of core: sources to parts, parts to thinned tiles, tiles to layers, and a manifest.
 
-The result is the same, byte for byte, with any number of workers and in any order; an interrupted build continues.
+The result is the same, byte for byte, with any number of workers and in any order. An interrupted build resumes.
 """
 
 from __future__ import annotations
@@ -33,9 +33,9 @@ WORK = ".build"
 """Folder in a site's directory for intermediate results; its small records stay after the build."""
 
 _SHARES = {"reading heads": 0.01, "finding extents": 0.04, "reading": 0.15, "thinning": 0.15, "building tiles": 0.65}
-"""Of the time of a build, for its bar."""
+"""Shares of the build time, for the progress bar."""
 
-_MIN_POINTS = 1000  # as for a map in one file
+_MIN_POINTS = 1000  # the same as for a map in one file
 
 Item = TypeVar("Item")
 Result = TypeVar("Result")
@@ -46,10 +46,10 @@ class SiteBuilt:
     """Result of a build.
 
     Attributes:
-        manifest: of the site.
-        source_points: points read.
-        reused: tiles that existed already.
-        skipped: sources and tiles that failed, and the reason, one line each.
+        manifest: manifest of the site.
+        source_points: number of points read.
+        reused: number of tiles that existed already.
+        skipped: sources and tiles that failed, with the reason, one line each.
         low, high: (3,) corners of the sources, metres.
     """
 
@@ -61,7 +61,7 @@ class SiteBuilt:
     high: Floats
 
     def summary(self) -> MapSummary:
-        """Summarise the map from its manifest, without a look at its points."""
+        """Summarise the map from its manifest, without reading points."""
         site = self.manifest
         area = max(1, sum(tile.area for tile in site.tiles))
         density = sum(tile.points for tile in site.tiles) / area
@@ -87,20 +87,20 @@ def build_site(
     keep_going: bool = False,
     progress: bool = False,
 ) -> SiteBuilt:
-    """Build a site, or bring it up to date with its sources.
+    """Build a site, or update it from its sources.
 
     Args:
-        given: cloud files, folders or patterns of them.
-        directory: of the site; made if it does not exist.
-        config: of the map.
+        given: cloud files, folders, or patterns.
+        directory: directory of the site, created if it does not exist.
+        config: settings of the map.
         crs: reference system of files that state none.
         key: signs the manifest.
         executor: runs the steps; None runs them in this process.
-        keep_going: skip sources and tiles that fail, instead of ending.
-        progress: show a bar on stderr, or a line for each stage where that is no terminal.
+        keep_going: skip sources and tiles that fail, instead of raising.
+        progress: show a bar on stderr, or one line per stage where stderr is no terminal.
 
     Raises:
-        CloudError: a source cannot be read. MapError: nothing to stand on, or the directory cannot be used.
+        CloudError: a source cannot be read. MapError: there are no stations, or the directory cannot be used.
         ConfigError: a setting that sites cannot have. InputError: no weights for learned features.
     """
     if config.learned:
@@ -112,7 +112,7 @@ def build_site(
     listed = sources_of(given, crs)
     if any(source.rows is not None for source in listed):
         raise InputError("a site is built of files; save the arrays as .npy first, or build one .coview file")
-    # by name in the manifest: the order of the arguments changes nothing
+    # sorted by their name in the manifest: the order of the arguments does not matter
     sources = dict(sorted(zip(short_names([source.path for source in listed]), listed, strict=True)))
     work = directory / WORK
     try:
@@ -164,7 +164,7 @@ def build_site(
 
 
 def check_directory(directory: Path) -> None:
-    """Refuse to build into anything but a new or empty directory, or a site (MapError)."""
+    """Raise MapError for a directory that is not new, empty or a site."""
     if directory.exists() and not directory.is_dir():
         raise MapError(f"{directory}: is a file; a site is a directory, a map in one file is called NAME.coview")
     if not directory.is_dir() or is_site(directory) or (directory / WORK).is_dir():
@@ -209,11 +209,11 @@ def _manifest(grid: SiteGrid, parts: Sequence[Parts], tiles: tuple[TileEntry, ..
 
 
 class _Run:
-    """Runs the steps of a build, one after the other.
+    """Runner of a build's steps, one after the other.
 
     Attributes:
         skipped: one line for each item that failed and was skipped.
-        left_out: names of these.
+        left_out: names of these items.
     """
 
     def __init__(self, executor: Executor, keep_going: bool, stage: Callable[[str], Progress]) -> None:
@@ -224,7 +224,7 @@ class _Run:
     def __call__(
         self, title: str, function: Callable[[Item], Result], items: Sequence[Item], names: Sequence[str]
     ) -> list[Result]:
-        """Return the results in the order of the items, without those that failed if that is allowed."""
+        """Return the results in the order of the items; failed items are left out if that is allowed."""
         results: dict[int, Result] = {}
         failed: dict[int, Exception] = {}
         step = self.stage(title)
@@ -245,7 +245,7 @@ class _Run:
 
 
 def _naming(name: str, error: Exception) -> Exception:
-    """Return the error with the name of the source or the tile."""
+    """Return the error with the name of its source or tile."""
     if Path(name).name in str(error):
         return error
     reason = error.strerror if isinstance(error, OSError) else str(error)

@@ -1,4 +1,4 @@
-"""Grid of a site's tiles, and parts of a site: circles, and files that name the tiles in one."""
+"""Grid of a site's tiles; circles that select a part of a site, and files that list its tiles."""
 
 from __future__ import annotations
 
@@ -17,9 +17,9 @@ from coview_stream.config import MapConfig
 from coview_stream.errors import ConfigError, MapError
 from coview_stream.geometry.arrays import Floats, Ints, Reals
 
-TILE = 320.0  # metres, a multiple of the other grids of a map (20, 16 and 32 m, stations' blocks of 2 m)
-HALO = 64.0  # metres around a tile whose points affect its layers: the radius of a virtual scan, and a margin
-FEATURE_HALO = 112.0  # likewise its learned features: 64 for the network, 48 for the ground below these
+TILE = 320.0  # metres, a multiple of a map's other grids (20, 16 and 32 m, and station blocks of 2 m)
+HALO = 64.0  # metres around a tile within which points affect its layers: the radius of a virtual scan, and a margin
+FEATURE_HALO = 112.0  # the same for its learned features: 64 for the network, 48 for the ground below these points
 PART_SUFFIX = ".tiles"
 _FORMAT = "coview-part"
 
@@ -29,9 +29,9 @@ class SiteGrid:
     """Grid of a site's tiles, and settings of their build.
 
     Attributes:
-        origin: (3,) metres, in the frame of the sources; corner of a tile.
-        tile: metres, a multiple of 320.
-        config: of the map.
+        origin: (3,) metres, in the frame of the sources; a corner of a tile.
+        tile: edge, metres, a multiple of 320.
+        config: settings of the map.
     """
 
     origin: tuple[float, float, float]
@@ -60,7 +60,7 @@ class SiteGrid:
 
 
 def origin_of(low: npt.ArrayLike, high: npt.ArrayLike) -> tuple[float, float, float]:
-    """Return the origin of a site with corners (3,): in the middle, rounded to 320 m; the lowest z, rounded to 10 m."""
+    """Return the origin of a site with corners (3,): its middle rounded to 320 m, its lowest z rounded to 10 m."""
     middle = 0.5 * (np.asarray(low, dtype=np.float64) + np.asarray(high, dtype=np.float64))
     x, y = (math.floor(float(value) / TILE) * TILE for value in middle[:2])
     return x, y, round(float(np.asarray(low, dtype=np.float64)[2]) / 10.0) * 10.0
@@ -85,7 +85,7 @@ class Around:
 
     @classmethod
     def parse(cls, text: str) -> Around:
-        """Parse ``X,Y,RADIUS``; ConfigError if it is something else."""
+        """Parse ``X,Y,RADIUS``; ConfigError if the text has another form."""
         try:
             x, y, radius = map(float, text.split(","))
         except ValueError:
@@ -98,9 +98,9 @@ class Around:
 
 
 def part_file(directory: Path, keys: Collection[Key], name: str) -> Path:
-    """Write a small file that is opened like a map: directory and tiles of a part of a site; return its path.
+    """Write directory and tiles of a part of a site into a small file that opens like a map, and return its path.
 
-    There is one file for each site and ``name``. MapError if the cache cannot be written.
+    There is one file per site and ``name``. MapError if the cache cannot be written.
     """
     place = str(directory.resolve())
     record = hashlib.sha256(f"{place}\n{name}".encode()).hexdigest()[:16] + PART_SUFFIX
@@ -108,7 +108,7 @@ def part_file(directory: Path, keys: Collection[Key], name: str) -> Path:
 
 
 def read_part(path: Path) -> tuple[Path, set[Key]]:
-    """Return the site's directory and the tiles in a file of :func:`part_file`; MapError if it is another file."""
+    """Return the site's directory and the tiles in a file of :func:`part_file`; MapError if it is no such file."""
     try:
         data = read_record(path)
         if data["format"] != _FORMAT:
@@ -119,7 +119,7 @@ def read_part(path: Path) -> tuple[Path, set[Key]]:
 
 
 def site_directory(path: Path) -> Path | None:
-    """Return the directory of the site at a map's path, or of the site of a part; None for a map file."""
+    """Return the site's directory for the path of a site or of a part; None for a map file."""
     if path.suffix == PART_SUFFIX and path.is_file():
         return read_part(path)[0]
     return path if path.is_dir() else None

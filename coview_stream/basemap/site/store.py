@@ -1,9 +1,9 @@
-"""Store of a site's layers, files named by their sha256; and the cache of working files and mirrors.
+"""Store of a site's layers in files named by their sha256, and the cache of working files and mirrors.
 
-The cache is ``$COVIEW_CACHE``, else ``coview-stream`` in the user's cache folder. Least recently used files are deleted
-to keep it within ``$COVIEW_CACHE_GB`` (20). Its files are trusted, for ``--verify-key`` as well: no other user reaches
-them. A folder that others may write or exchange is refused. One that they may read is closed to them, and files that
-they could write meanwhile are deleted.
+The cache is ``$COVIEW_CACHE``, else ``coview-stream`` in the user's cache folder. The least recently used files are
+deleted to keep it within ``$COVIEW_CACHE_GB`` (20). Its files are trusted, even with ``--verify-key``, because no other
+user reaches them: a folder that others may write or replace is refused; a folder that they may read is closed to them,
+and the files that they could write until then are deleted.
 """
 
 from __future__ import annotations
@@ -43,14 +43,14 @@ class TileStore:
     """Layers in the folder ``layers`` of a site's directory, or of a cache.
 
     Attributes:
-        folder: of the files, in subfolders by the first two digits of their names.
+        folder: folder of the files, with subfolders by the first two digits of their names.
     """
 
     def __init__(self, directory: Path) -> None:
         self.folder = directory / _FOLDER
 
     def path(self, sha256: str) -> Path:
-        """Return the file of a layer, which need not exist; MapError if it is no hash."""
+        """Return the file of a layer, which need not exist; MapError if ``sha256`` is no hash."""
         return self.folder.parent / layer_path(sha256)
 
     def put(self, content: bytes) -> str:
@@ -70,7 +70,7 @@ class TileStore:
         return sha256
 
     def get(self, sha256: str, size: int) -> bytes:
-        """Return a layer's bytes; MapError if the file is missing, cut off or changed."""
+        """Return a layer's bytes; MapError if the file is missing, truncated or changed."""
         path = self.path(sha256)
         try:
             with open_plain(path) as file:
@@ -97,7 +97,7 @@ class TileStore:
         return True
 
     def prune(self, hashes: Collection[str]) -> None:
-        """Delete all other layers than these."""
+        """Delete all layers except these."""
         for path in self.folder.glob("[0-9a-f][0-9a-f]/*"):
             if SHA256.fullmatch(path.name) and path.name not in hashes:
                 path.unlink(missing_ok=True)
@@ -109,7 +109,7 @@ _OURS = (f"{_HASH}*.coview", f"joined-{_HASH}*.coview", "parts/*", "sites/[0-9a-
 
 
 def cache_folder() -> Path:
-    """Return the folder of the cache, made if it does not exist; MapError unless it is its user's alone."""
+    """Return the cache folder, created if it does not exist; MapError if other users may write to it."""
     named = os.environ.get("COVIEW_CACHE")
     base = os.environ.get("XDG_CACHE_HOME") or str(Path("~/.cache").expanduser())
     folder = Path(named) if named else Path(base) / "coview-stream"
@@ -126,7 +126,7 @@ def cache_folder() -> Path:
                 )
             if state.st_mode & 0o077:
                 folder.chmod(0o700)
-                # made by the umask, which may have let others write them; the folder may hold its user's files too
+                # the umask may have let others write these; match by pattern, as the folder may hold other files too
                 for path in itertools.chain.from_iterable(folder.glob(names) for names in _OURS):
                     if path.is_file() and path.stat().st_mode & 0o022:
                         path.unlink()
@@ -173,7 +173,7 @@ def evict(folder: Path, *keep: Path) -> None:
     bound, files = cache_bound(), []
     for path in (*folder.glob("*.coview"), *folder.glob("sites/*")):
         with contextlib.suppress(OSError):  # another process may delete it meanwhile
-            parts = [path, *path.rglob("*")]  # of a mirror its files
+            parts = [path, *path.rglob("*")]  # a mirror with its files
             used = [at.stat().st_mtime for at in (path, path.with_suffix(_MARK)) if at.exists()]
             files.append((max(used, default=0.0), sum(part.stat().st_size for part in parts if part.is_file()), path))
     total = sum(size for _, size, _ in files)
@@ -204,7 +204,7 @@ def _is_held(path: Path) -> bool:
 
 
 def hold(file: BinaryIO) -> None:
-    """Lock an open file against :func:`evict` as long as it, or a mapping of it, is open in any process."""
+    """Lock an open file against :func:`evict` while it, or a mapping of it, is open in any process."""
     with contextlib.suppress(ImportError, OSError):
         import fcntl
 
@@ -212,9 +212,9 @@ def hold(file: BinaryIO) -> None:
 
 
 def checked(path: Path) -> FileIdentity | None:
-    """Return the identity of a cached file when its content was last compared with its checksum, if it ever was.
+    """Return the identity that a cached file had when last compared with its checksum, None if it never was.
 
-    This marks the file as used now.
+    Also marks the file as just used.
     """
     mark = path.with_suffix(_MARK)
     try:
@@ -238,7 +238,7 @@ def remember_written(path: Path) -> None:
 
 @contextmanager
 def lock(path: Path) -> Iterator[None]:
-    """Let one process write a file at a time; on systems without locks several may write the same file."""
+    """Let one process at a time write a file; on systems without locks several may write the same file."""
     try:
         import fcntl
     except ImportError:

@@ -1,6 +1,6 @@
-"""Steps of a site's build, from a source to tiles: partition, thinning, and building of one tile.
+"""Steps of a site's build: partition of a source, thinning of a tile, and building of a tile.
 
-Each step is a pure function of complete files and of the settings; its result is not made again if it exists.
+Each step is a pure function of complete files and of the settings, and is skipped if its result exists.
 """
 
 from __future__ import annotations
@@ -34,23 +34,23 @@ from coview_stream.geometry.arrays import Bools, Floats, Floats32, Reals
 from coview_stream.geometry.transforms import Points
 from coview_stream.geometry.validation import MAX_COORDINATE
 
-_CODE = 2  # version of the tiles' content: tiles of other versions are built again
-_MAX_STRAYS = 1 << 15  # columns or rows from the origin: farther points are on no site
+_CODE = 2  # version of the tiles' content: tiles of other versions are rebuilt
+_MAX_STRAYS = 1 << 15  # columns or rows from the origin; farther points are dropped
 _SLAB = 8_000_000  # points thinned at a time: 0.6 GB
 
 
 @dataclass(frozen=True)
 class Parts:
-    """Points of a source, in files by tile.
+    """Points of a source in one file per tile.
 
     Attributes:
-        folder: of a file ``COLUMN_ROW.f4`` for each tile, (N, 3) float32 metres about its corner.
-        name: of the source.
-        sha256: of the source.
-        crs: stated by the source.
-        points: usable points of the source.
+        folder: folder with a file ``COLUMN_ROW.f4`` for each tile, (N, 3) float32 metres from the tile's corner.
+        name: name of the source.
+        sha256: hash of the source.
+        crs: reference system that the source states.
+        points: number of usable points.
         tiles: number of points by column and row.
-        metres: of a unit of x, y and z, where the given one is not the metre.
+        metres: length of the units of x, y and z, if the given unit is not the metre.
     """
 
     folder: Path
@@ -87,7 +87,7 @@ def extent_of(source: Source) -> tuple[Floats, Floats]:
 
 
 def partition(job: tuple[Source, str, SiteGrid, Path]) -> Parts:
-    """Write the points of a source, by its name in the manifest, into files by tile; ``FOLDER.json`` completes them.
+    """Write the points of a source (with its name in the manifest) into one file per tile; ``FOLDER.json`` comes last.
 
     Raises:
         CloudError: the source cannot be read. OSError: the parts cannot be written.
@@ -99,7 +99,7 @@ def partition(job: tuple[Source, str, SiteGrid, Path]) -> Parts:
     metres = () if unit is None else unit.metres
     state = [str(source.path.resolve()), stat.st_size, stat.st_mtime_ns, list(grid.origin), grid.tile, source.crs]
     state += metres
-    with contextlib.suppress(OSError, ValueError, KeyError, TypeError):  # not there, or not complete
+    with contextlib.suppress(OSError, ValueError, KeyError, TypeError):  # missing or incomplete
         facts = json.loads(done.read_bytes())
         tiles = {(column, row): count for column, row, count in facts["tiles"]}
         parts = Parts(folder, name, facts["sha256"], facts["crs"], facts["points"], tiles, metres)
@@ -123,7 +123,7 @@ def partition(job: tuple[Source, str, SiteGrid, Path]) -> Parts:
 
 
 class _Writer(CloudBuilder):
-    """Builder that writes the chunks into the tiles' files."""
+    """Builder that appends each chunk to the tiles' files."""
 
     def __init__(self, grid: SiteGrid, folder: Path) -> None:
         super().__init__()
@@ -156,7 +156,7 @@ def _usable(raw: Reals) -> Floats:
 
 @dataclass(frozen=True)
 class ThinJob:
-    """Arguments of :func:`thin`: a tile, the parts with points there, by name, and a folder for the thinned points."""
+    """Arguments of :func:`thin`: a tile, the parts by name with points on it, and a folder for the thinned points."""
 
     grid: SiteGrid
     key: Key
@@ -171,7 +171,7 @@ class ThinJob:
 
     @property
     def file(self) -> Path:
-        """File of the result: (N, 3) float32 metres about the tile's corner."""
+        """File of the result: (N, 3) float32 metres from the tile's corner."""
         return self.folder / f"{self.key[0]}_{self.key[1]}.{self.digest[:16]}.npy"
 
 
@@ -179,7 +179,7 @@ class ThinJob:
 class TileJob:
     """Arguments of :func:`build_tile`: a tile, the site's directory, and a folder for entries of finished tiles.
 
-    ``thinned`` has of the tile and the tiles around it key, file of the thinned points, and hash of their inputs.
+    ``thinned`` has, for the tile and each tile around it, key, file of the thinned points, and hash of their inputs.
     """
 
     grid: SiteGrid
@@ -190,7 +190,7 @@ class TileJob:
 
     @property
     def record(self) -> Path:
-        """File of the tile's entry; its name has the hash of all inputs."""
+        """File of the tile's entry, named by the hash of all inputs."""
         weights = ""
         if self.grid.config.learned:
             from coview_stream.descriptors.feature_map import weights_sha256
@@ -222,9 +222,9 @@ def thin(job: ThinJob) -> int:
 
 
 def build_tile(job: TileJob) -> tuple[TileEntry | None, bool]:
-    """Write a tile's layers; return its entry, None if no points are left, and whether it existed already."""
+    """Write a tile's layers; return its entry (None if no points are left), and whether it existed already."""
     store, record = TileStore(job.site), job.record
-    with contextlib.suppress(OSError, ValueError):  # not there, or not complete
+    with contextlib.suppress(OSError, ValueError):  # missing or incomplete
         plain = json.loads(record.read_bytes())
         if plain is None:
             return None, True
@@ -241,7 +241,7 @@ def build_tile(job: TileJob) -> tuple[TileEntry | None, bool]:
 def _build(job: TileJob, store: TileStore) -> TileEntry | None:
     config, tile = job.grid.config, job.grid.tile
     halo = FEATURE_HALO if config.learned else HALO
-    around = []  # thinned points (N, 3) on the tile and around it, about its corner
+    around = []  # thinned points (N, 3) on and around the tile, from its corner
     for key, file, _ in job.thinned:
         shift = np.array([key[0] - job.key[0], key[1] - job.key[1], 0.0]) * tile
         moved = (np.load(file, mmap_mode="r", allow_pickle=False) + shift).astype(np.float32)
@@ -255,7 +255,7 @@ def _build(job: TileJob, store: TileStore) -> TileEntry | None:
         return None
     normals, planarity = estimate_normals(near, config.normal_neighbours, config.normal_radius)
     corner = job.grid.corner(job.key)
-    # in the site's frame: neighbouring tiles find the same blocks
+    # in the site's frame, so that neighbouring tiles have the same blocks
     stations = find_stations((near + corner).astype(np.float32), config.block, config.levels)
     stations = stations[_within((stations - corner).astype(np.float32), tile, 0.0)]
     features = None
@@ -278,7 +278,7 @@ def write_tile(
 ) -> TileEntry:
     """Write the layers of a tile, and return its entry.
 
-    ``cloud`` has points (N, 3) about the tile's corner, unit normals (N, 3) and planarity (N,); stations (M, 3) are
+    ``cloud`` has points (N, 3) from the tile's corner, unit normals (N, 3) and planarity (N,); stations (M, 3) are
     relative to the site's origin.
     """
     points = cloud[0]

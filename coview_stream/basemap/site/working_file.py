@@ -1,4 +1,4 @@
-"""Files in the cache that nodes map into memory: the working file of a site, and the layers of a map's field."""
+"""Cache files that nodes map into memory: the working file of a site, and the layers of a map's field."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ log = logging.getLogger("coview_stream.maps")
 
 
 def open_site(place: Path, check: bool = True, verify_key: VerifyKey | None = None) -> tuple[Path, Loaded]:
-    """Return the working file of a site, or of the part of one in a file, and its content; a damaged one is made again.
+    """Return the working file of a site, or of the part that a file names, and its content; rebuild a damaged one.
 
     ``check`` compares the content with its checksum, unless that has been done since it was written.
     """
@@ -47,7 +47,7 @@ def open_site(place: Path, check: bool = True, verify_key: VerifyKey | None = No
 
 
 def open_made(make: Callable[[], Path], check: bool = True) -> tuple[Path, Loaded]:
-    """Return the cached file that ``make`` returns or writes, and its content; a damaged one is made again."""
+    """Return the cached file that ``make`` returns or writes, and its content; rebuild a damaged one."""
     path = make()
     before = checked(path)
     try:
@@ -69,10 +69,10 @@ def working_file(
     progress: bool | None = None,
     keys: Collection[Key] | None = None,
 ) -> Path:
-    """Return the working file of a site, or of some tiles, and write it if it does not exist, some seconds a tile.
+    """Return the working file of a site, or of some tiles; write it, some seconds a tile, if it does not exist.
 
-    Tiles that the earlier working file has are copied. ``progress`` None shows a bar on a terminal. Of a mirror in a
-    state that no map can be made of, the state that was opened last is used, with a warning.
+    Unchanged tiles are copied from the earlier working file. ``progress`` None shows a bar on a terminal. If a mirror's
+    state gives no map, the state that was opened last is used, with a warning.
 
     Raises:
         MapError: no site, a layer is missing or damaged, not signed with the key, or no room in the cache.
@@ -109,7 +109,7 @@ def _written(directory: Path, manifest: Manifest, progress: bool | None, keys: C
             ArrayFiles(folder) as into,
         ):
             arrays, parameters = assemble(manifest, TileStore(directory), into, step, keys, earlier)
-            check_arrays(arrays, config, points=False)  # points are where their tiles are
+            check_arrays(arrays, config, points=False)  # their tiles bound the points
             save(path, arrays | field_layers(arrays, into), parameters)
         remember_written(path)
         write_record(_record_name(directory), path.name)
@@ -118,9 +118,9 @@ def _written(directory: Path, manifest: Manifest, progress: bool | None, keys: C
 
 
 def with_shared_layers(arrays: Arrays, sha256: str) -> Arrays:
-    """Return a map's arrays with the rasters of its field mapped from a file in the cache, one for all processes.
+    """Return a map's arrays with the layers of its field mapped from one cache file for all processes.
 
-    A site's working file holds them itself. Where the cache cannot be used they are left out, to be made in memory.
+    A site's working file already holds its layers. If the cache cannot be used they are left out, and built in memory.
     """
     if f"{LAYERS}table" not in arrays and FIELD_ARRAYS[0] in arrays:
         with contextlib.suppress(CoViewError, OSError):
@@ -141,7 +141,7 @@ def _layers_file(arrays: Arrays, sha256: str) -> Path:
 
 
 def earlier_file(directory: Path) -> Path | None:
-    """Return the working file of a site that was used last, if it still exists."""
+    """Return the last used working file of a site, if it still exists."""
     try:
         path = cache_folder() / str(read_record(cache_folder() / "parts" / _record_name(directory)))
     except (OSError, ValueError):
@@ -150,7 +150,7 @@ def earlier_file(directory: Path) -> Path | None:
 
 
 def _open_earlier(path: Path | None, channels: Sequence[Channel], states: Mapping[Key, str]) -> EarlierMap:
-    """Open an earlier working file; one that cannot be read, or has another form, is as good as none."""
+    """Open an earlier working file; an unreadable file, or one of another form, counts as none."""
     if path is None:
         return EarlierMap()
     try:
