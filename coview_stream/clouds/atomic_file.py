@@ -1,4 +1,4 @@
-"""Files that are complete or not there: written under a temporary name in the same directory, then renamed."""
+"""Atomic files: written under a temporary name in the same directory, then renamed."""
 
 from __future__ import annotations
 
@@ -19,13 +19,11 @@ _BOOT = Path("/proc/sys/kernel/random/boot_id")
 
 @contextmanager
 def atomic_path(path: Path, temporary: Path | None = None) -> Iterator[Path]:
-    """Yield a name that becomes ``path`` at the end of the block, or is deleted if the block raises.
+    """Yield a path that is renamed to ``path`` at the end of the block, or deleted if the block raises.
 
-    Partial files of the same name left by killed processes are deleted first: those of this host and process
-    namespace at once, all others after a day, because their processes cannot be seen from here.
-
-    An existing file stays whole until the new one is complete. ``temporary`` is the name to write under, in the same
-    directory; by default one that is unique to this process.
+    An existing file stays whole until the new one is complete. ``temporary`` is the path to write to, in the same
+    directory, by default unique to this process. Partial files that killed processes have left are deleted first: at
+    once if written on this host and in this process namespace, otherwise after a day, as their processes are invisible.
     """
     part = temporary or path.with_name(f".{path.name}.{_host()}.{os.getpid()}.part")
     if temporary is None:
@@ -40,7 +38,7 @@ def atomic_path(path: Path, temporary: Path | None = None) -> Iterator[Path]:
 def _remove_left(path: Path) -> None:
     """Delete partial files of ``path`` whose writer has ended."""
     form = re.compile(re.escape(f".{path.name}.") + r"(?:([0-9a-f]{8})\.)?([0-9]{1,10})\.part")
-    with contextlib.suppress(OSError):  # the write that follows reports a bad directory
+    with contextlib.suppress(OSError):  # the write reports a bad directory
         for entry in os.scandir(path.parent):
             match = form.fullmatch(entry.name)
             if match is None or not 0 < (process := int(match[2])) < 1 << 31:
@@ -49,7 +47,7 @@ def _remove_left(path: Path) -> None:
             if match[1] == _host():
                 try:
                     os.kill(process, 0)
-                except OSError as error:  # another user's process lives
+                except OSError as error:  # another user's process is alive
                     dead = isinstance(error, ProcessLookupError)
             if dead or time.time() - entry.stat(follow_symlinks=False).st_mtime > _ABANDONED:
                 Path(entry.path).unlink(missing_ok=True)
@@ -58,7 +56,7 @@ def _remove_left(path: Path) -> None:
 def _host() -> str:
     """Return a short name of this host, its process namespace (one per container) and its boot.
 
-    The boot id tells apart hosts cloned from one image, which share name and namespace number.
+    The boot id distinguishes hosts cloned from one image, which share name and namespace number.
     """
     try:
         namespace, boot = Path("/proc/self/ns/pid").stat().st_ino, _BOOT.read_text()
@@ -71,8 +69,8 @@ def _host() -> str:
 def atomic_file(path: Path, *, sync: bool = False, private: bool = False) -> Iterator[BinaryIO]:
     """Open a binary stream that becomes ``path`` at the end of the block (:func:`atomic_path`); OSError if it cannot.
 
-    With ``sync`` it is flushed to disk before renaming; otherwise a power cut may leave an empty file. A
-    ``private`` file is readable by its owner alone, and no link in the place of the temporary file is followed.
+    With ``sync`` the file is flushed to disk before it is renamed; otherwise a power cut may leave an empty file. Only
+    its owner can read a ``private`` file, and a link in place of its temporary file is not followed.
     """
     flags, mode = (os.O_EXCL, 0o600) if private else (os.O_TRUNC, 0o666)
     flags |= os.O_WRONLY | os.O_CREAT | getattr(os, "O_BINARY", 0)

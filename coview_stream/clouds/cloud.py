@@ -17,7 +17,7 @@ from coview_stream.geometry.validation import MAX_COORDINATE
 
 LOCAL_LIMIT = 10_000.0
 """Metres: smaller coordinates keep a zero origin, because float32 still resolves 1 mm."""
-_ORIGIN_STEP = 100.0  # metres: origins are multiples of it, so that offsets between tiles are exact
+_ORIGIN_STEP = 100.0  # metres: origins are multiples of this, so that offsets between tiles are exact
 
 _COARSE_FLOAT32 = 1e6  # metres: beyond, float32 is coarser than 6 cm
 
@@ -28,11 +28,11 @@ class Cloud:
 
     Attributes:
         points: (N, 3) float32 metres, ``raw - origin``, subtracted in float64.
-        origin: (3,) float64 metres. Zeros if the cloud lies within ``LOCAL_LIMIT`` of its frame's zero,
-            otherwise the median, rounded to 100 m, of the points.
+        origin: (3,) float64 metres. Zero if the cloud lies within ``LOCAL_LIMIT`` of its frame's zero, otherwise the
+            median of the points, rounded to 100 m.
         crs: coordinate reference system as stated in the file (WKT or ``EPSG:code``), else None.
         classification: (N,) uint8 LAS classes, if the format has them.
-        dropped: rows left out: not finite, beyond ``MAX_COORDINATE``, withheld or labelled as noise.
+        dropped: number of rows left out: not finite, beyond ``MAX_COORDINATE``, withheld or labelled as noise.
     """
 
     points: Points
@@ -76,7 +76,7 @@ class CloudBuilder:
         if self.origin is None:
             self.origin = np.zeros(3)
             if np.abs(raw).max() >= LOCAL_LIMIT:
-                # a sparse median, not the bounding box: one stray point must not move the origin
+                # the median, not the bounding box: one stray point must not move the origin
                 middle = np.median(raw[:: max(1, len(raw) // 10_000)].astype(np.float64), axis=0)
                 self.origin = np.round(middle / _ORIGIN_STEP) * _ORIGIN_STEP + 0.0  # + 0.0 turns -0.0 into 0.0
             if raw.dtype == np.float32 and np.abs(self.origin).max() > _COARSE_FLOAT32:
@@ -107,9 +107,9 @@ class CloudBuilder:
 
 
 def merge(clouds: Sequence[Cloud]) -> Cloud:
-    """Join several clouds of the same frame, re-based in float64 to the origin of the first.
+    """Join several clouds of the same frame, shifted in float64 to the origin of the first.
 
-    Classes are kept only if every cloud has them; dropped rows add up.
+    Classes are kept only if every cloud has them; dropped rows are added up.
 
     Raises:
         CloudError: no cloud was given, or the clouds name different reference systems.

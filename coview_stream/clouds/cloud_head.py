@@ -1,4 +1,4 @@
-"""Heads of cloud files, and whether several files belong to one site: checked before any is read whole."""
+"""Heads of cloud files, and the check, before any is read whole, that several files belong to one site."""
 
 from __future__ import annotations
 
@@ -18,10 +18,10 @@ from coview_stream.errors import CloudError
 from coview_stream.geometry.arrays import Bools, Floats
 
 _MAX_GAP = 1000.0  # metres between tiles of one site; a lake or a field may lie between them
-_FAR_GAP = 10_000.0  # metres between files that are never one site
-_MAX_AREA = 50e6  # square metres of the box around a site: the limit of a build's rasters, cells of 0.5 m
+_FAR_GAP = 10_000.0  # metres: files farther apart are not one site
+_MAX_AREA = 50e6  # square metres of a site's bounding box: limit of a build's rasters with cells of 0.5 m
 _SAMPLED_POINTS = 100_000  # of a cloud, to measure its extent
-_STRAY = 0.5  # per cent of the points at either end that do not count for the extent
+_STRAY = 0.5  # per cent of the points at either end that the extent excludes
 
 
 @dataclass(frozen=True, eq=False)
@@ -29,11 +29,11 @@ class CloudHead:
     """Facts about a cloud file.
 
     Attributes:
-        path: of the file.
+        path: path of the file.
         crs: reference system, as :attr:`Cloud.crs`.
-        points: their number; 0 if the format does not state it.
-        unit: of the file, if its points are converted to metres.
-        low, high: (3,) float64 corners of its extent, metres; None if the format does not state them.
+        points: number of points; 0 if the format does not state it.
+        unit: unit of the file, if its points are converted to metres.
+        low, high: (3,) float64 corners of the extent, metres; None if the format does not state them.
     """
 
     path: Path
@@ -48,7 +48,7 @@ def read_head(path: str | os.PathLike[str]) -> CloudHead:
     """Check a file as far as possible without reading its points.
 
     Raises:
-        CloudError: as of :func:`~coview_stream.clouds.files.read_cloud`.
+        CloudError: see :func:`~coview_stream.clouds.files.read_cloud`.
     """
     path = Path(path)
     if check_format(path) != "LAS":
@@ -75,10 +75,10 @@ def _extent(cloud: Cloud) -> Floats:
 
 
 def head_of(path: Path, cloud: Cloud) -> CloudHead:
-    """Return the head of a file that was read, its extent without stray points.
+    """Return the head of a file that was read, with its extent without stray points.
 
     Raises:
-        CloudError: the extent exceeds that of a map.
+        CloudError: the extent is too large for a map.
     """
     low, high = _extent(cloud)
     wide = high - low
@@ -92,9 +92,9 @@ def head_of(path: Path, cloud: Cloud) -> CloudHead:
 
 
 def check_together(heads: Sequence[CloudHead]) -> str | None:
-    """Check by their heads that files can be one site; return a sentence about an unusual gap, None if there is none.
+    """Check by their heads that files can be one site; return a sentence about an unusual gap, else None.
 
-    CloudError names two that are in different reference systems, or too far apart for a map.
+    CloudError names two files that have different reference systems or are too far apart for a map.
     """
     stated = [head for head in heads if head.crs is not None]
     for head in stated[1:]:
@@ -111,7 +111,7 @@ def check_together(heads: Sequence[CloudHead]) -> str | None:
     if near.all():
         return None
     far = ~near if near.sum() >= (~near).sum() else near
-    gap, one, other = np.inf, 0, 0  # the smallest gap between one of ``far`` and one of the others
+    gap, one, other = np.inf, 0, 0  # smallest gap between a file in ``far`` and another file
     for at in np.flatnonzero(far).tolist():
         gaps = np.where(far, np.inf, _gaps(low, high, at))
         if gaps.min() < gap:
@@ -127,7 +127,7 @@ def check_together(heads: Sequence[CloudHead]) -> str | None:
 
 
 def _connected(low: Floats, high: Floats) -> Bools:
-    """Find the boxes (N, 2) that are connected to the first by gaps below 1 km."""
+    """Mask the boxes, with corners (N, 2), that gaps below 1 km connect to the first."""
     reached = np.zeros(len(low), dtype=bool)
     reached[0] = True
     fresh = [0]

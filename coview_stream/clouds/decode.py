@@ -1,6 +1,6 @@
-"""A child process that decodes LAZ, E57 and COPC: native decoders crash, or take all memory, on hostile files.
+"""A child process that decodes LAZ, E57 and COPC, because native decoders crash or take all memory on hostile files.
 
-An abort of the decoder costs one error, not this process. :mod:`coview_stream.clouds.decode_child` is the other end.
+If the decoder aborts, this process gets an error. :mod:`coview_stream.clouds.decode_child` is the other end.
 """
 
 from __future__ import annotations
@@ -21,15 +21,15 @@ from coview_stream.clouds.python_child import python_command, python_environment
 from coview_stream.errors import CloudError
 
 _MAX_END_S = 5.0  # for a child to end by itself
-_MAX_LINE = 1 << 20  # bytes of an answer's line; a reference system's text is the longest
-_IDLE_S = 10.0  # an idle child, which holds 90 MB, ends after that
+_MAX_LINE = 1 << 20  # bytes of a line of an answer, at the longest a reference system's text
+_IDLE_S = 10.0  # after which an idle child, which holds 90 MB, is ended
 _LIMITS = {  # threads' stacks and heaps count against the child's memory limit
     "RAYON_NUM_THREADS": "4", "OPENBLAS_NUM_THREADS": "1", "OMP_NUM_THREADS": "1", "MALLOC_ARENA_MAX": "2",
 }  # fmt: skip
 
 
 class DecodingChild:
-    """A child that answers requests one at a time; started when needed, ended when idle or at exit."""
+    """A child process that answers one request at a time; started on demand, ended when idle or at exit."""
 
     def __init__(self) -> None:
         self._lock = threading.Lock()
@@ -42,14 +42,14 @@ class DecodingChild:
         """Send a request, hand decoded points to a builder, and return the last answer.
 
         Raises:
-            CloudError: the file is damaged, or asked for more memory than a file of its size can need.
+            CloudError: the file is damaged, or its decoder wanted more memory than a file of its size can need.
         """
         with self._lock:
             self._idle.cancel()
             try:
                 answer = self._exchange(request, builder)
             except BaseException:
-                self._end(kill=True)  # its next bytes would belong to this request
+                self._end(kill=True)  # or the next request would read the rest of this answer
                 raise
             self._idle = threading.Timer(_IDLE_S, self.close)
             self._idle.daemon = True
@@ -97,7 +97,7 @@ class DecodingChild:
             stdout=subprocess.PIPE,
             stderr=subprocess.DEVNULL,
             env=python_environment() | _LIMITS,
-            start_new_session=True,  # Ctrl-C is answered by this process
+            start_new_session=True,  # this process handles Ctrl-C
         )
         self._owner = os.getpid()
         return self._child
@@ -120,7 +120,7 @@ class DecodingChild:
 
 
 def damaged(path: str | Path, reason: str) -> str:
-    """Return the error text of a file whose sizes the decoder could not serve."""
+    """Return the error text for a file with sizes that the decoder could not allocate."""
     kind = Path(path).suffix.removeprefix(".").upper()
     return f"{path}: damaged or truncated {kind} ({reason} at what the file asks for); copy or export the file again"
 
@@ -129,14 +129,17 @@ _shared = DecodingChild()
 
 
 def decode_in_child(path: Path, builder: CloudBuilder) -> None:
-    """Decode a LAZ or E57 file in the shared child into a builder, with its system (:meth:`DecodingChild.ask`)."""
+    """Decode a LAZ or E57 file into a builder, in the shared child, with its reference system.
+
+    CloudError as in :meth:`DecodingChild.ask`.
+    """
     builder.crs = _shared.ask({"path": str(path.resolve())}, builder).get("crs")
 
 
 def copy_window(source: str, low: tuple[float, float], high: tuple[float, float], target: Path) -> dict[str, int]:
-    """Write the points of a COPC file's window to a LAS file, in the shared child; return the fields of ``Fetched``.
+    """Write the points in a window of a COPC file to a LAS file, in the shared child; return the fields of ``Fetched``.
 
-    CloudError if the file cannot be read, is no COPC file, or no point is in the window.
+    CloudError if the file cannot be read or is no COPC file, or if the window has no points.
     """
     answer = _shared.ask({"path": source, "low": low, "high": high, "target": str(target)})
     return {name: answer[name] for name in ("points", "received", "requests")}

@@ -1,13 +1,13 @@
-"""The child that decodes LAZ, E57 and COPC with a limit on its memory: ``python -P -m ...decode_child``.
+"""The child process that decodes LAZ, E57 and COPC with limited memory: ``python -P -m ...decode_child``.
 
-Native decoders believe the sizes in a file; an absurd allocation may abort the process. One JSON request a line comes
-from stdin:
+Native decoders trust the sizes in a file, and an absurd allocation may abort the process. stdin brings one JSON request
+per line:
 
 ``{"path"}``
-    decode a LAZ or E57 file. Each chunk is a line ``{"points", "dropped"}``, then raw coordinates, (N, 3) float64
+    Decode a LAZ or E57 file. Each chunk is a line ``{"points", "dropped"}``, then raw coordinates, (N, 3) float64
     metres, and N classes, uint8. The last line has ``end`` and ``crs``.
 ``{"path", "low", "high", "target"}``
-    write a window of a COPC file to the LAS file ``target``; the answer has ``end`` and counts.
+    Write a window of a COPC file to the LAS file ``target``; the answer has ``end`` and counts.
 
 An answer with ``error`` is a text for people.
 """
@@ -29,17 +29,17 @@ from coview_stream.clouds.decode import damaged
 from coview_stream.clouds.fetch import RangeFile, is_web_address
 from coview_stream.errors import CloudError
 
-_BASE = 1 << 30  # bytes beside a multiple of the file's size; a chunk of 10^6 points takes a third
-_PER_BYTE = 4  # bytes per byte of the file: a chunk's compressed layers, and copies of them
-_WINDOW_BYTES = 6 << 30  # for a window of a COPC file
-_WINDOW_POINTS = 60_000_000  # of the chunks that meet a window: 5 GB
+_BASE = 1 << 30  # bytes allowed for any file; a chunk of 10^6 points takes a third
+_PER_BYTE = 4  # bytes allowed per byte of the file: a chunk's compressed layers, and copies of them
+_WINDOW_BYTES = 6 << 30  # allowed for a window of a COPC file
+_WINDOW_POINTS = 60_000_000  # in the chunks that meet a window: 5 GB
 
 
 def main() -> None:
     """Answer requests until stdin ends."""
     out = os.fdopen(os.dup(1), "wb", buffering=1 << 20)
-    os.dup2(2, 1)  # libraries may print: only answers go to the pipe
-    with contextlib.suppress(ImportError):  # E57 does without
+    os.dup2(2, 1)  # libraries may print, but the pipe is for answers only
+    with contextlib.suppress(ImportError):  # E57 does not need it
         import laspy  # noqa: F401 - before the first limit
 
     try:
@@ -126,7 +126,7 @@ def _window(name: str, low: Any, high: Any, target: str) -> dict[str, int]:
 
 
 def _limit(size: int) -> None:
-    with contextlib.suppress(ImportError, ValueError, OSError):  # macOS has none; a process of its own still helps
+    with contextlib.suppress(ImportError, ValueError, OSError):  # macOS has no limit; a separate process still helps
         import resource
 
         resource.setrlimit(resource.RLIMIT_AS, (size, resource.getrlimit(resource.RLIMIT_AS)[1]))

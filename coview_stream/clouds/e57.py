@@ -1,4 +1,4 @@
-"""E57 files: all scans, placed by their poses in the file's frame. Needs ``pye57`` (extra ``e57``)."""
+"""E57 files: all scans, transformed by their poses to the file's frame. Needs ``pye57`` (extra ``e57``)."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ def require_pye57() -> Any:
 
 
 def decode(path: Path, builder: CloudBuilder) -> None:
-    """Read a file chunk by chunk in this process into a builder, with its reference system.
+    """Read a file chunk by chunk into a builder, in this process, with its reference system.
 
     Points that the scanner marks as invalid are dropped and counted. CloudError if it is damaged, or not in metres.
     """
@@ -52,7 +52,7 @@ def decode(path: Path, builder: CloudBuilder) -> None:
 
 
 def _scan(file: Any, index: int) -> Iterator[tuple[Floats, int]]:
-    """Yield a scan's points (N, 3) in the file's frame and the number of invalid ones, chunk by chunk."""
+    """Yield a scan's points (N, 3) in the file's frame and the number of invalid points, chunk by chunk."""
     header = file.get_header(index)
     names = next((kind for kind in (_CARTESIAN, _SPHERICAL) if set(kind) <= set(header.point_fields)), None)
     if names is None:

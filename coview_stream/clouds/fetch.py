@@ -1,6 +1,6 @@
-"""Clouds of web servers, whole or by HTTP range requests, and windows of COPC files.
+"""Downloads of clouds from web servers, whole or by HTTP range requests, and windows of COPC files.
 
-A window's points are written to a LAS file, to be read like any other.
+A window's points are written to a LAS file.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ from coview_stream.errors import CloudError, ConfigError
 _TIMEOUT = 30.0  # seconds without a byte
 _TRIES = 4
 _WAIT = 0.5  # seconds before the second try, doubled before each further one
-_BLOCK = 1 << 16  # bytes of a request at least: a header, its records and a hierarchy are many small reads
+_BLOCK = 1 << 16  # least bytes of a request: a header, its records and a hierarchy are many small reads
 _ANSWERS = (http.client.NOT_MODIFIED, http.client.REQUESTED_RANGE_NOT_SATISFIABLE)
 _BUSY = (408, 425, 429, 500, 502, 503, 504)
 _FAILURES = (urllib.error.URLError, http.client.HTTPException, TimeoutError, ConnectionError)
@@ -49,7 +49,7 @@ class Window:
 
     @classmethod
     def parse(cls, text: str) -> Window:
-        """Return the window that ``X0,Y0,X1,Y1`` means; ConfigError for any other text."""
+        """Parse ``X0,Y0,X1,Y1``; ConfigError for any other text."""
         try:
             x0, y0, x1, y1 = map(float, text.split(","))
         except ValueError:
@@ -68,9 +68,9 @@ class Fetched:
     """Counts of a fetched file.
 
     Attributes:
-        points: in the window.
-        received: bytes from a web server; 0 of a local file.
-        requests: to the web server.
+        points: number of points in the window.
+        received: bytes from a web server; 0 for a local file.
+        requests: number of requests to the web server.
     """
 
     points: int
@@ -79,7 +79,7 @@ class Fetched:
 
 
 def is_web_address(name: str | os.PathLike[str]) -> bool:
-    """Return whether a name is an address of a web server."""
+    """Return whether a name is an address on a web server."""
     return str(name).lower().startswith(("http://", "https://"))
 
 
@@ -93,10 +93,11 @@ def is_copc(path: Path) -> bool:
 
 
 def fetch_cloud(source: str | os.PathLike[str], folder: Path, window: Window | None = None) -> tuple[Path, Fetched]:
-    """Write a cloud of a web server, or a window of a COPC file, into a folder; return the new file, and counts.
+    """Write a cloud from a web server, or a window of a COPC file, into a folder; return the new file, and counts.
 
     Raises:
-        CloudError: it cannot be read, is no COPC file, or no point is in the window. OSError: it cannot be written.
+        CloudError: the source cannot be read or is no COPC file, or the window has no points.
+        OSError: the file cannot be written.
     """
     name = PurePosixPath(unquote(urlsplit(str(source)).path)).name if is_web_address(source) else Path(source).name
     if name in ("", ".", "..") or "\0" in name or os.sep in name:
@@ -121,7 +122,7 @@ def _free(path: Path) -> Path:
 
 
 def download(address: str, target: Path) -> int:
-    """Write a file of a web server to ``target``; return its size in bytes. CloudError if the server broke off."""
+    """Download a file to ``target``, and return its size in bytes; CloudError if the server breaks off."""
     with open_web_file(urllib.request.Request(address)) as answer, target.open("wb") as file:
         try:
             shutil.copyfileobj(answer, file, 1 << 20)
@@ -134,10 +135,10 @@ def download(address: str, target: Path) -> int:
 
 
 def _nearness(address: str) -> list[int]:
-    """Return for each address of a web server: 0 on the internet, 1 in a private network, 2 on the link, 3 here."""
+    """Rate each address of a web server: 0 on the internet, 1 in a private network, 2 on the link, 3 this machine."""
     try:
         found = {info[4][0] for info in socket.getaddrinfo(urlsplit(address).hostname, None)}
-    except OSError:  # known to a proxy, perhaps
+    except OSError:  # a proxy may know it
         return [0]
     out = []
     for text in found:
@@ -148,7 +149,7 @@ def _nearness(address: str) -> list[int]:
 
 
 class _Redirects(urllib.request.HTTPRedirectHandler):
-    """Follows a server's word to other web servers, never from https to http, nor nearer to this machine than it is."""
+    """Handler that follows redirects, but not from https to http, nor to a server nearer to this machine."""
 
     def redirect_request(
         self, req: urllib.request.Request, fp: Any, code: int, msg: str, headers: Any, newurl: str
@@ -164,7 +165,7 @@ _OPENER = urllib.request.build_opener(_Redirects)
 
 
 def open_web_file(request: urllib.request.Request) -> Any:
-    """Return the answer to a request, tried again while the server is busy; CloudError if it cannot be fetched."""
+    """Return the answer to a request, which is repeated while the server is busy; CloudError if all tries fail."""
     address = request.full_url
     if not is_web_address(address):
         raise CloudError(f"{address}: not an http:// or https:// address")
@@ -176,7 +177,7 @@ def open_web_file(request: urllib.request.Request) -> Any:
                 return error
             if error.code not in _BUSY or not left:
                 raise CloudError(f"{address}: the server answers {error.code} {error.reason}; check it") from error
-        except ValueError as error:  # of an address, perhaps one that the server sends us to
+        except ValueError as error:  # a bad address, perhaps from a redirect
             raise CloudError(f"{address}: leads to an address that is none ({error}); check it") from error
         except _FAILURES as error:
             if not left:
@@ -187,11 +188,11 @@ def open_web_file(request: urllib.request.Request) -> Any:
 
 
 class RangeFile:
-    """A file of a web server, read by range requests; laspy's reader needs ``read``, ``seek``, ``tell`` and ``close``.
+    """A file on a web server, read by range requests, with the methods that laspy's reader needs.
 
     Attributes:
-        requests: made so far.
-        received: bytes so far.
+        requests: number of requests so far.
+        received: bytes received so far.
     """
 
     def __init__(self, address: str) -> None:
@@ -202,7 +203,7 @@ class RangeFile:
         self.received = 0
 
     def seek(self, offset: int, whence: int = os.SEEK_SET) -> int:
-        """Go to a byte from the beginning, or from the current one."""
+        """Move to a byte counted from the beginning or from the current one."""
         self._at = offset + (self._at if whence == os.SEEK_CUR else 0)
         if whence == os.SEEK_END or self._at < 0:
             raise OSError("can only be read from its beginning on")
@@ -213,7 +214,7 @@ class RangeFile:
         return self._at
 
     def read(self, size: int) -> bytes:
-        """Return ``size`` bytes, fewer at the file's end; CloudError if the server lacks it or serves no ranges."""
+        """Return ``size`` bytes, fewer at the file's end; CloudError if the file is missing or it has no ranges."""
         begin = self._at - self._begin
         if not (begin >= 0 and begin + size <= len(self._block)):
             self._block, self._begin, begin = self._request(max(size, _BLOCK)), self._at, 0

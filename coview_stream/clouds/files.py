@@ -1,4 +1,4 @@
-"""Point cloud files: found by name, read and written by suffix; written files are complete or not there."""
+"""Point cloud files: found by name, read and (atomically) written in the format of their suffix."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ _WHOLE_READERS: dict[str, Callable[[Path], Cloud]] = {
 }  # fmt: skip
 
 CLOUD_SUFFIXES = frozenset(_FORMATS)
-"""Suffixes, lower case with their dot, that ``read_cloud`` accepts."""
+"""Suffixes that ``read_cloud`` accepts, lower case with the dot."""
 
 _ANY_TEXT = frozenset({".txt", ".csv", ".txt.gz", ".csv.gz"})  # in a folder such files may be stamps, poses or notes
 
@@ -57,16 +57,16 @@ _FORMAT_BYTE = 104  # of a LAS header
 
 
 def is_cloud_name(path: str | os.PathLike[str]) -> bool:
-    """Tell whether a file that is found in a folder has a cloud's suffix; .txt, .csv and hidden files do not count."""
+    """Return whether a file in a folder is a cloud by its suffix; .txt, .csv and hidden files do not count."""
     name = Path(path).name
     return suffix_of(Path(name)) in CLOUD_SUFFIXES - _ANY_TEXT and not name.startswith(".")
 
 
 def expand_cloud_paths(given: Iterable[str | os.PathLike[str]]) -> list[Path]:
-    """Return the files that names, folders and patterns (``tiles/*.laz``) mean, in natural order within each.
+    """Return the files for names, folders and patterns (``tiles/*.laz``), in natural order within each.
 
-    A folder means the clouds directly in it, by their suffix; those of its subfolders are warned of. A named file is
-    returned with any suffix, for its reader to judge. CloudError if a folder or a pattern holds no cloud.
+    A folder gives the clouds directly in it, by suffix, with a warning if its subfolders have clouds. A named file may
+    have any suffix; its reader checks it. CloudError if a folder or a pattern has no cloud.
     """
     out: list[Path] = []
     for path in map(Path, given):
@@ -97,7 +97,7 @@ def natural_key(path: Path) -> tuple[tuple[int, int, str], ...]:
 
 
 def suffix_of_content(head: bytes) -> str | None:
-    """Return the suffix of a cloud by its first bytes, of text if they are no other; None if they are of no cloud."""
+    """Return the suffix for a cloud's first bytes, by default the suffix of text; None if they are no cloud's."""
     content = sniff(head)
     if content == "gzip":
         return ".xyz.gz"
@@ -107,7 +107,7 @@ def suffix_of_content(head: bytes) -> str | None:
 
 
 def check_format(path: Path) -> str:
-    """Return the format that a file's suffix names; CloudError if the first bytes are of another one."""
+    """Return the format for a file's suffix; CloudError if the first bytes belong to another format."""
     suffix = suffix_of(path)
     head = _head(path)
     if suffix not in _FORMATS:
@@ -115,7 +115,7 @@ def check_format(path: Path) -> str:
         raise CloudError(f"{path}: unknown cloud suffix {suffix!r}; convert it to one of {known}")
     name = _FORMATS[suffix]
     content = sniff(head)
-    # raw float rows and text have no magic
+    # raw float rows and text have no magic bytes
     unmarked = content is None and (suffix == ".bin" or (name == "text" and b"\0" not in head))
     expected = "gzip" if suffix.endswith(".gz") else name
     if content != expected and not (unmarked and expected == name):
@@ -128,12 +128,12 @@ def check_format(path: Path) -> str:
 def read_cloud(path: str | os.PathLike[str]) -> Cloud:
     """Read LAS, LAZ (COPC too), E57, PCD, PLY, NPY, text or KITTI ``.bin``; metres, in the file's own frame.
 
-    The suffix names the format and the first bytes must agree with it. Rows that are not finite are dropped
-    and counted, as are LAS points that are withheld or labelled as noise.
+    The suffix names the format, and the first bytes must agree with it. Rows that are not finite are dropped and
+    counted, as are LAS points that are withheld or labelled as noise.
 
     Raises:
-        CloudError: the file is missing, a directory, empty, truncated, of another or unsupported format, or
-            holds no usable point. The message names the file and the remedy.
+        CloudError: the file is missing, a directory, empty or truncated, has another or an unsupported format, or has
+            no usable point. The message names the file and the remedy.
     """
     path = Path(path)
     try:
@@ -150,10 +150,10 @@ def read_cloud(path: str | os.PathLike[str]) -> Cloud:
 
 
 def stream_cloud(path: Path, builder: CloudBuilder, unit: SurveyUnit | None = None) -> str | None:
-    """Pass a file's points to a builder, raw, float64 metres; return its reference system, if stated.
+    """Pass a file's raw points, float64 metres, to a builder; return the reference system, if the file states one.
 
-    ``unit`` is that of a file that states none. LAS, LAZ and E57 come in chunks of a million points; other formats are
-    read whole first. CloudError as of :func:`read_cloud`, but not for a file without points.
+    ``unit`` is for a file that states none. LAS, LAZ and E57 are read in chunks; other formats are read whole first.
+    CloudError as in :func:`read_cloud`, except for a file without points.
     """
     kind = check_format(path)
     builder = builder if unit is None else InMetres(builder, unit)
@@ -166,10 +166,10 @@ def stream_cloud(path: Path, builder: CloudBuilder, unit: SurveyUnit | None = No
 
 
 def _decode(path: Path, kind: str, builder: CloudBuilder) -> None:
-    # a missing library is reported here, not from the child
+    # report a missing library here, not from the child
     require = las.require_laspy if kind == "LAS" else require_pye57
     require()
-    if kind == "E57" or _head(path)[_FORMAT_BYTE : _FORMAT_BYTE + 1] >= b"\x80":  # the bit of compressed points
+    if kind == "E57" or _head(path)[_FORMAT_BYTE : _FORMAT_BYTE + 1] >= b"\x80":  # the bit that marks compressed points
         decode_in_child(path, builder)
     else:
         las.decode(path, builder)
@@ -192,7 +192,7 @@ def _head(path: Path) -> bytes:
 
 
 def sniff(head: bytes) -> str | None:
-    """Return the name of the format whose magic bytes start ``head``; None if there is none."""
+    """Return the name of the format whose magic bytes begin ``head``; None for other bytes."""
     for magic, name in _MAGIC:
         if head.startswith(magic):
             return name
@@ -202,7 +202,7 @@ def sniff(head: bytes) -> str | None:
     if text.startswith(b"#") and b".PCD" in text[:80]:
         return "PCD"
     if all(byte in b"\t\r\n" or 32 <= byte < 127 for byte in head):
-        # comment lines may come before a PCD's first keyword
+        # comment lines may precede a PCD's first keyword
         return "PCD" if b"\nFIELDS" in head or b"\nVERSION" in head else "text"
     return None
 
@@ -210,11 +210,11 @@ def sniff(head: bytes) -> str | None:
 def write_cloud(path: str | os.PathLike[str], points: Reals, origin: npt.ArrayLike | None = None) -> None:
     """Write (N, 3) points in metres, shifted by a float64 ``origin`` (3,), in the format of the suffix.
 
-    PCD and PLY are binary little-endian. PCD, PLY and NPY hold float32, or float64 if ``origin`` moves the
-    points beyond 10 km; LAS and LAZ hold millimetres; ``.bin`` is always float32 with zero intensity.
+    PCD and PLY are binary little-endian. PCD, PLY and NPY hold float32, or float64 if ``origin`` shifts the points
+    beyond 10 km; LAS and LAZ hold millimetres; ``.bin`` is always float32 with zero intensity.
 
     Raises:
-        CloudError: unknown suffix, wrong shape, far coordinates for ``.bin``, or the file cannot be written.
+        CloudError: unknown suffix, wrong shape, coordinates too large for ``.bin``, or the file cannot be written.
     """
     path = Path(path)
     writer = _WRITERS.get(path.suffix.lower())

@@ -1,4 +1,4 @@
-"""Filters on local (N, 3) float32 points: outliers, voxel grid, normals."""
+"""Filters of (N, 3) float32 points near zero: outliers, voxel grid, normals."""
 
 from __future__ import annotations
 
@@ -9,15 +9,15 @@ from coview_stream.geometry.arrays import Bools, Floats, Floats32, Ints
 from coview_stream.geometry.transforms import Points
 
 _MAX_CELLS = 2**62  # voxel keys must fit a signed 64-bit integer
-_BLOCK = 1 << 14  # points at a time: twenty neighbours of each, 8 MB an axis
+_BLOCK = 1 << 14  # points at a time: with twenty neighbours each, 8 MB per axis
 
 
 def remove_outliers(points: Points, neighbours: int = 20, std_ratio: float = 2.0) -> tuple[Points, Bools]:
-    """Drop points unusually far from their neighbours (Rusu, 2009); return the rest and the mask (N,) of them.
+    """Drop points unusually far from their neighbours (Rusu, 2009); return the remaining points and their mask (N,).
 
-    Outliers are points (float32, finite) whose mean distance to the nearest ``neighbours``, themselves among them,
-    exceeds the cloud's mean by ``std_ratio`` standard deviations. Several seconds per million points: run it after
-    ``voxel_grid`` on large maps.
+    Outliers are points (float32, finite) whose mean distance to the nearest ``neighbours``, including themselves,
+    exceeds the cloud's mean by ``std_ratio`` standard deviations. Takes several seconds per million points: thin large
+    maps with ``voxel_grid`` first.
     """
     if len(points) <= neighbours:
         return points, np.ones(len(points), dtype=bool)
@@ -33,8 +33,8 @@ def remove_outliers(points: Points, neighbours: int = 20, std_ratio: float = 2.0
 def voxel_grid(points: Points, voxel: float) -> Points:
     """Return the centroids of the occupied voxels, in the order of their keys (x slowest, z fastest).
 
-    Points (N, 3) are float32 metres, finite; borders of voxels are multiples of the edge ``voxel``, metres. ConfigError
-    if it is so small for this extent that keys would overflow.
+    Points (N, 3) are float32 metres, finite; voxels are aligned to multiples of their edge ``voxel``, metres.
+    ConfigError if it is so small for this extent that keys would overflow.
     """
     if not len(points):
         return points.reshape(0, 3)
@@ -59,19 +59,19 @@ def voxel_grid(points: Points, voxel: float) -> Points:
 
 
 def estimate_normals(points: Points, k: int = 20, radius: float | None = None) -> tuple[Points, Floats32]:
-    """Estimate unit normals (N, 3) float32 from the local covariance, oriented upwards (nz >= 0), and planarity (N,).
+    """Estimate upward unit normals (N, 3) float32, from the local covariance, and planarity (N,).
 
-    Planarity is 1 - 3 s, with s the share of the covariance's smallest eigenvalue ("surface variation", Pauly et al.,
-    2002): 1 on a plane, 0 for isotropic scatter as in a crown. Fewer than three neighbours give (0, 0, 1) and 0.
+    Planarity is 1 - 3 s, where s is the share of the covariance's smallest eigenvalue ("surface variation", Pauly et
+    al., 2002): 1 on a plane, 0 for isotropic scatter as in a crown. Fewer than three neighbours give (0, 0, 1) and 0.
 
-    Points (N, 3) are float32 metres, finite; neighbours are the ``k`` nearest, within ``radius`` metres if it is given.
+    Points (N, 3) are float32 metres, finite; neighbours are the ``k`` nearest, within ``radius`` metres if given.
     """
     if not len(points):
         return points.reshape(0, 3), np.empty(0, dtype=np.float32)
     from scipy.spatial import cKDTree
 
     tree, reach = cKDTree(points), np.inf if radius is None else radius
-    columns = [np.append(points[:, axis].astype(np.float64), 0.0) for axis in range(3)]  # the last row: no neighbour
+    columns = [np.append(points[:, axis].astype(np.float64), 0.0) for axis in range(3)]  # last row: no neighbour
     normals, planarity = np.empty_like(points), np.empty(len(points), dtype=np.float32)
     for start in range(0, len(points), _BLOCK):
         block = slice(start, min(start + _BLOCK, len(points)))
@@ -84,11 +84,11 @@ def estimate_normals(points: Points, k: int = 20, radius: float | None = None) -
 
 
 def _plane(gaps: list[Floats], count: Ints) -> tuple[Floats, Floats]:
-    """Return normals (N, 3) and planarity (N,) of the points at ``gaps``, three (N, K), of which ``count`` (N,) are."""
+    """Return normals (N, 3) and planarity (N,) from offsets to neighbours: three axes (N, K), ``count`` (N,) valid."""
     means = [gap.sum(axis=1) / count for gap in gaps]
     covariance = np.empty((len(count), 3, 3))
     for row in range(3):
-        for column in range(row + 1):  # the lower half is what eigh reads
+        for column in range(row + 1):  # eigh reads only the lower half
             products = np.einsum("nk,nk->n", gaps[row], gaps[column]) / count
             covariance[:, row, column] = products - means[row] * means[column]
     values, vectors = np.linalg.eigh(covariance)

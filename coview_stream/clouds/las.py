@@ -1,7 +1,7 @@
 """LAS and LAZ files (COPC too), read in chunks by laspy.
 
-The sizes in a header are checked first: a wrong number of records keeps laspy busy for minutes, and a wrong chunk table
-makes the LAZ decoder allocate more memory than there is.
+The sizes in a header are checked first, because a wrong number of records keeps laspy busy for minutes, and a wrong
+chunk table makes the LAZ decoder allocate too much memory.
 """
 
 from __future__ import annotations
@@ -26,12 +26,12 @@ from coview_stream.geometry.arrays import Floats
 CHUNK = 1_000_000
 """Points per chunk: about 100 MB of float64 and record buffers."""
 NOISE_CLASSES = (7, 18)
-"""ASPRS classes low and high noise."""
+"""ASPRS classes of low and high noise."""
 _MIN_HEADER, _MAX_HEADER = 227, 375  # bytes
 _WKT_RECORD = "LASF_Projection", 2112
-_POINTWISE = 1  # LASzip's number of the compressor without chunks
+_POINTWISE = 1  # LASzip's number for the compressor without chunks
 _VARIABLE = 0xFFFFFFFF  # points per chunk, if the chunk table states them
-_POINTS_PER_BYTE = 4  # surveys take 2 to 6 bytes a point, a plane without noise half a byte
+_POINTS_PER_BYTE = 4  # at most: surveys take 2 to 6 bytes per point, a plane without noise half a byte
 
 
 def require_laspy() -> Any:
@@ -42,10 +42,10 @@ def require_laspy() -> Any:
 
 @contextlib.contextmanager
 def las_writer(stream: BinaryIO, header: Any, path: Path) -> Iterator[Any]:
-    """Open laspy's writer of LAS, or of LAZ by the suffix of ``path``, on a stream that stays open.
+    """Open laspy's writer for LAS, or LAZ by the suffix of ``path``, on a stream that stays open.
 
     Raises:
-        OSError: the stream cannot be written, also where the LAZ encoder has an exception of its own for that.
+        OSError: the stream cannot be written; the LAZ encoder's own exception is converted.
     """
     laspy, lazrs = require_laspy(), require_library("lazrs", "lazrs>=0.6", "LAS and LAZ files")
     compress = path.suffix.lower() == ".laz"
@@ -63,9 +63,10 @@ def read_header(path: Path) -> Any:
 
 
 def decode(path: Path, builder: CloudBuilder) -> None:
-    """Read a file chunk by chunk in this process into a builder, in metres, with its reference system.
+    """Read a file chunk by chunk into a builder, in this process, in metres, with its reference system.
 
-    Withheld points and the classes of noise are dropped and counted. CloudError if it is damaged or not in a plane.
+    Points that are withheld or classified as noise are dropped and counted. CloudError if the file is damaged, or for
+    the reasons of :func:`system_of`.
     """
     with _reader(path) as reader:
         builder.crs, unit = system_of(path, reader.header)
@@ -75,12 +76,12 @@ def decode(path: Path, builder: CloudBuilder) -> None:
 
 
 def system_of(path: Path, header: Any) -> tuple[str | None, SurveyUnit | None]:
-    """Return the reference system that a header states, WKT or ``EPSG:code``, and the unit; None if it states none.
+    """Return the reference system in a header, WKT or ``EPSG:code``, None if it states none, and the unit.
 
-    The system of a file in feet is returned in metres, and its unit; a unit of None is the metre.
+    The system of a file in feet is returned in metres, with its unit; None is the metre.
 
     Raises:
-        CloudError: no map can be made in that system (degrees, lengths that differ from those on the ground).
+        CloudError: the system allows no map (degrees, or lengths that differ from lengths on the ground).
     """
     records = [*header.vlrs, *(header.evlrs or ())]
     wkt = ""
@@ -94,7 +95,7 @@ def system_of(path: Path, header: Any) -> tuple[str | None, SurveyUnit | None]:
             warn(f"{path}: its reference system is not UTF-8, unreadable letters are replaced; export the file again")
         elif kind == "GeoKeyDirectoryVlr":
             for key in record.geo_keys:
-                if key.tiff_tag_location == 0:  # the value itself; others point into records of doubles or text
+                if key.tiff_tag_location == 0:  # the value itself; others refer to records of doubles or text
                     keys.setdefault(key.id, key.value_offset)
     text = stated_system(wkt, keys)
     low, high, unit = header.mins, header.maxs, unit_of_system(text, keys)
@@ -117,7 +118,7 @@ def _reader(path: Path) -> Iterator[Any]:
             _check_sizes(stream, size)
             logger = logging.getLogger("laspy")
             level = logger.level
-            logger.setLevel(logging.ERROR)  # it warns of records that this module judges itself
+            logger.setLevel(logging.ERROR)  # it warns of records that this module checks itself
             try:
                 reader = laspy.open(stream, closefd=False)
             finally:
@@ -167,7 +168,7 @@ def _truncated(path: Path, promised: int, count: int) -> CloudError:
 
 
 def _check_sizes(stream: BinaryIO, size: int) -> None:
-    """Check the sizes that laspy believes; ValueError if one is impossible in a file of ``size`` bytes."""
+    """Check the sizes that laspy trusts; ValueError if one is impossible in a file of ``size`` bytes."""
     head = stream.read(_MAX_HEADER)
     stream.seek(0)
     if len(head) < _MIN_HEADER:
@@ -182,7 +183,7 @@ def _check_sizes(stream: BinaryIO, size: int) -> None:
 
 
 def _check_points(path: Path, header: Any, stream: BinaryIO, size: int) -> None:
-    """Check the sizes that the point decoder believes: points, chunks, and the chunk table of LAZ."""
+    """Check the sizes that the point decoder trusts: points, chunks, and the chunk table of LAZ."""
     start, points = header.offset_to_point_data, header.point_count
     if not header.are_points_compressed:
         stored = max(0, size - start) // header.point_format.size
@@ -205,7 +206,7 @@ def _check_points(path: Path, header: Any, stream: BinaryIO, size: int) -> None:
     if not start + 8 <= table <= size - 8:
         raise ValueError("the chunk table is not in the file")
     stream.seek(table + 4)
-    # a chunk holds at least one point, whose first record is stored as it is
+    # a chunk has at least one point, and its first record is stored uncompressed
     if int.from_bytes(stream.read(4), "little") * 20 > size:
         raise ValueError("more chunks than fit")
     stream.seek(start)

@@ -1,4 +1,4 @@
-"""PCD files: ascii, binary and binary_compressed, with fields of any order and type."""
+"""PCD files: ascii, binary and binary_compressed, with fields in any order and of any type."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ _LZF_RATIO = 88  # LZF's maximum: a back reference of 3 bytes yields up to 264
 
 @dataclass(frozen=True)
 class _Header:
-    """Header of a PCD file: type, count and number of each field, and of each axis its field."""
+    """Header of a PCD file: type and count of each field, the field of each axis, and the number of points."""
 
     types: tuple[np.dtype[np.generic], ...]
     counts: tuple[int, ...]
@@ -45,7 +45,7 @@ def read_pcd(path: Path) -> Cloud:
     """Read x, y and z of a PCD file; other fields and the viewpoint are ignored.
 
     Raises:
-        CloudError: the header is wrong, x, y or z is missing, or there is less data than the header promises.
+        CloudError: the header is wrong, x, y or z is missing, or there is less data than the header states.
     """
     content = path.read_bytes()
     header = _parse_header(content, path)
@@ -143,7 +143,7 @@ def _ascii(content: bytes, header: _Header, path: Path) -> Reals:
 
 
 def _compressed(content: bytes, header: _Header, path: Path) -> Reals:
-    """Unpack a body: one LZF block, field after field, each for all points."""
+    """Unpack a body: one LZF block with all points of the first field, then of the next."""
     start = header.data_start + 8
     if len(content) < start:
         raise _truncated(path, header, 0)

@@ -1,4 +1,4 @@
-"""PLY files: ascii and binary in either byte order; before the vertices of a binary file no element has lists."""
+"""PLY files: ascii and binary in either byte order; elements before the vertices of a binary file have no lists."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ _MAX_HEADER = 64 * 1024  # bytes
 
 @dataclass
 class _Element:
-    """An element of the header: name, number of rows and their properties."""
+    """An element of the header: name, number of rows, and properties."""
 
     name: str
     count: int

@@ -7,7 +7,7 @@ import time
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 
-_SHORT = 10.0  # seconds of work that needs no lines
+_SHORT = 10.0  # seconds; shorter work prints no lines
 
 Progress = Callable[[int, int], None]
 """Called with (done, total)."""
@@ -17,12 +17,12 @@ Progress = Callable[[int, int], None]
 def progress_bar(
     title: str, show: bool | None = None, unit: str = "", scale: bool = False
 ) -> Iterator[Callable[..., None]]:
-    """Show a bar on stderr, and yield the function that moves it: a :data:`Progress`; a third argument is a note.
+    """Show a bar on stderr, and yield the function that moves it, a :data:`Progress` with a note as third argument.
 
     Args:
-        title: of the bar.
+        title: title of the bar.
         show: None shows it on a terminal only.
-        unit: of the numbers.
+        unit: unit of the numbers.
         scale: print thousands as k, millions as M.
     """
     from tqdm import tqdm
@@ -32,7 +32,7 @@ def progress_bar(
 
         def step(done: int, total: int, note: str | None = None) -> None:
             if done < bar.n:
-                bar.reset()  # the time that is left is of this step
+                bar.reset()  # restarts the estimate of the time left
             bar.total = total
             bar.update(done - bar.n)
             if note is not None:
@@ -43,12 +43,12 @@ def progress_bar(
 
 @contextmanager
 def staged_bar(shares: Mapping[str, float], show: bool) -> Iterator[Callable[[str], Progress]]:
-    """Show one bar of successive stages, with the time that is left, and yield the function that begins a stage.
+    """Show one bar for successive stages, with the time left, and yield the function that begins a stage.
 
-    Where stderr is no terminal, each stage is one line instead, as soon as the work has taken ten seconds.
+    If stderr is no terminal, each stage prints a line instead, once the work has taken ten seconds.
 
     Args:
-        shares: of the whole time, by stage, in order.
+        shares: share of each stage in the whole time, in order.
         show: whether anything is shown.
     """
     from tqdm import tqdm

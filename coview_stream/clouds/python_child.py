@@ -13,7 +13,7 @@ def python_command(module: str, *args: str) -> list[str]:
 
 
 def python_environment() -> dict[str, str]:
-    """Return the environment of such a command: this package importable, the current directory not searched."""
+    """Return the environment for such a command, which imports this package but not from the current directory."""
     # empty and relative entries refer to the current directory
     paths = os.pathsep.join(path for path in sys.path if Path(path).is_absolute())
     return os.environ | {"PYTHONPATH": paths, "PYTHONSAFEPATH": "1"}

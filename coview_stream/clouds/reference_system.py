@@ -1,7 +1,7 @@
 """Coordinate reference systems of cloud files and maps.
 
-A map must be in metres, east, north and up, with lengths as on the ground: an undetected error of scale looks like a
-robot that is never found.
+A map must be in metres, east, north and up, with lengths as on the ground: on a map of a wrong scale a robot is never
+found.
 """
 
 from __future__ import annotations
@@ -19,18 +19,18 @@ from coview_stream.geometry.arrays import Floats
 
 _PROJECTED, _GEOGRAPHIC, _VERTICAL = 3072, 2048, 4096  # GeoTIFF keys of reference systems
 LINEAR_UNIT, VERTICAL_UNIT = 3076, 4099  # GeoTIFF keys of units
-_CODES = range(1024, 32767)  # of EPSG; 32767 is a system described by other keys
+_CODES = range(1024, 32767)  # EPSG; 32767 is a system that other keys describe
 _METRE = 9001
 FOOT = 0.3048  # metres
-UNKNOWN = "unknown"  # name of no system
-_NORTH_STEP = 10.0  # metres along the map's north axis, to measure true north
+UNKNOWN = "unknown"  # name without a system
+_NORTH_STEP = 10.0  # metres along the map's north axis that measure true north
 _UNITS = {9002: "feet", 9003: "US survey feet", 9005: "Clarke's feet", 9014: "fathoms", 9093: "miles"}
 
-_MAX_SCALE_ERROR = 0.01  # of a projection's lengths: half a metre in 50 m
+_MAX_SCALE_ERROR = 0.01  # of a projection: half a metre in 50 m
 
 
 def stated_system(wkt: str, keys: Mapping[int, int]) -> str | None:
-    """Return the stated system: WKT, ``EPSG:code`` or ``EPSG:code+vertical code``; None if it states none."""
+    """Return the stated system: WKT, ``EPSG:code`` or ``EPSG:code+vertical code``; None if there is none."""
     if wkt:
         return wkt
     horizontal = next((keys[key] for key in (_PROJECTED, _GEOGRAPHIC) if keys.get(key, 0) in _CODES), None)
@@ -41,7 +41,7 @@ def stated_system(wkt: str, keys: Mapping[int, int]) -> str | None:
 
 
 def flaw_of_system(text: str | None, keys: Mapping[int, int], low: Floats, high: Floats) -> str | None:
-    """Return why no map can be made of coordinates in this system, and the remedy; None if one can.
+    """Return why coordinates in this system allow no map, and the remedy; None if they do.
 
     Args:
         text: the system, from :func:`stated_system`.
@@ -76,7 +76,7 @@ def unchecked_system(text: str | None) -> bool:
 
 
 def flaw_of_name(text: str) -> str | None:
-    """Return why a system named by a person does not fit metric coordinates; None if it does, or without pyproj."""
+    """Return why a system that a user named does not fit metric coordinates; None if it does, or without pyproj."""
     if importlib.util.find_spec("pyproj") is None:
         return None
     system = parse_system(text)
@@ -88,7 +88,7 @@ def flaw_of_name(text: str) -> str | None:
 
 
 def same_system(one: str | None, other: str | None) -> bool:
-    """Return whether two systems may be the same: one may be unknown, or state no heights."""
+    """Return whether two systems may be the same, as when one is unknown or states no heights."""
     if one is None or other is None or one == other:
         return True
     first, second = parse_system(one), parse_system(other)
@@ -125,7 +125,7 @@ def _like_degrees(low: Floats, high: Floats) -> bool:
 
 
 def parse_system(text: str | None) -> Any:
-    """Return a pyproj.CRS; None without pyproj, or for an unknown text, since its points may be good."""
+    """Return a pyproj.CRS; None without pyproj, or for an unknown text, as the points may still be good."""
     if not text or importlib.util.find_spec("pyproj") is None:
         return None
     import pyproj
@@ -137,7 +137,7 @@ def parse_system(text: str | None) -> Any:
 
 
 def parts_of_system(system: Any) -> list[Any]:
-    """Return the horizontal part of a system and, if it has one, the vertical."""
+    """Return the horizontal part of a system and, if it has one, the vertical part."""
     whole = system.source_crs if system.is_bound and system.source_crs is not None else system
     return [part.source_crs if part.is_bound else part for part in (whole.sub_crs_list or [whole])]
 
@@ -155,7 +155,7 @@ def _flaw(system: Any, centre: Floats) -> str | None:
             unit = {"foot": "feet", "US survey foot": "US survey feet"}.get(axis.unit_name, axis.unit_name)
             return f"{subject} are in {unit} ({system.name})"
     place = _longitude_latitude(parts[0], centre)
-    if place is None:  # outside of the system's area
+    if place is None:  # outside the system's area
         return None
     import pyproj
 
@@ -179,7 +179,7 @@ def _longitude_latitude(projected: Any, centre: Floats) -> tuple[float, float] |
 
 
 def _metric_system(system: Any, low: Floats, high: Floats) -> str:
-    """Name a metric system for the place, if possible."""
+    """Name a metric system for the location, if possible."""
     how = "a metric system, for example with `pdal translate -f filters.reprojection`"
     centre = 0.5 * (low + high)
     if system is None or parts_of_system(system)[0].is_geocentric:
@@ -198,10 +198,10 @@ class GeoReference:
     """Conversion of map coordinates to WGS 84.
 
     Heights are above the ellipsoid if the system states its vertical datum and pyproj has the grid for it; otherwise
-    they are the map's.
+    they are the map's heights.
 
     Args:
-        crs: of the map, WKT or ``EPSG:code``.
+        crs: reference system of the map, WKT or ``EPSG:code``.
 
     Raises:
         InputError: the map has no reference system, or one without a place on Earth. DependencyError: no pyproj.
@@ -226,7 +226,7 @@ class GeoReference:
     def geodetic(self, positions: Floats) -> Floats:
         """Return latitude, longitude (degrees) and height (metres), (N, 3), of positions (N, 3) in the map frame.
 
-        NaN for a position without a place on Earth.
+        NaN for a position that is not on Earth.
         """
         x, y, z = np.asarray(positions, dtype=np.float64).reshape(-1, 3).T
         if self._has_heights:
@@ -250,8 +250,8 @@ class GeoReference:
         return (math.pi / 2.0 - yaw + self.convergence(position)) % (2.0 * math.pi)
 
     def enu_covariance(self, position: Floats, covariance: Floats) -> Floats:
-        """Return a covariance (3, 3) of x, y, z in map axes as one of east, north, up, m2."""
-        angle = self.convergence(position)  # by which the map's axes are turned clockwise
+        """Rotate a covariance (3, 3), m2, from the map's x, y, z to east, north, up."""
+        angle = self.convergence(position)  # clockwise, of the map's axes
         turn = np.array(
             [[math.cos(angle), math.sin(angle), 0.0], [-math.sin(angle), math.cos(angle), 0.0], [0, 0, 1.0]]
         )

@@ -1,4 +1,4 @@
-"""Clouds as bare rows of numbers: text (one point a line), NPY, and KITTI's and nuScenes' ``.bin``."""
+"""Clouds as plain rows of numbers: text (one point per line), NPY, and the ``.bin`` of KITTI and nuScenes."""
 
 from __future__ import annotations
 
@@ -19,11 +19,11 @@ from coview_stream.geometry.arrays import Floats, Floats32
 
 _PLAIN = (".xyz", ".txt", ".csv", ".asc", ".pts", ".xyzi", ".xyzrgb")
 TEXT_SUFFIXES = (*_PLAIN, *(f"{suffix}.gz" for suffix in _PLAIN))
-"""Suffixes, lower case, of text that is read as points."""
+"""Suffixes of text clouds, lower case."""
 
 _LINES = 100_000  # read at a time
 _MAX_LINE = 4096  # characters of a point
-_MAX_UNPACKED = 30  # times a file's size: digits of points shrink to a third or a tenth
+_MAX_UNPACKED = 30  # times a file's size: gzip packs the digits of points to between a third and a tenth
 _MAX_HEAD = 100  # lines of titles and comments before the first point
 _COMMENTS = ("#", "//", ";", "%")
 _TITLES = {
@@ -35,20 +35,20 @@ _DECIMAL_COMMAS = re.compile(r"^\s*-?\d+,\d+(?:[\s;\t]+-?\d+,\d+)+\s*$")
 
 _KITTI_COLUMNS, _NUSCENES_COLUMNS = 4, 5
 _COLUMNS = (3, 4, 5, 6, 7, 8)  # of float32 rows
-_COMMON_ROW = 840  # a multiple of each number of columns: all are judged by the same values
-# tried with 3 to 8 columns of frames of three scanners (tests/clouds/test_rows.py)
+_COMMON_ROW = 840  # values, a multiple of each number of columns, so that the same values judge all of them
+# tested with 3 to 8 columns on frames of three scanners (tests/clouds/test_rows.py)
 _JUDGED, _MIN_JUDGED = 100_000, 3000  # values
 _BINS = 64
-_ALIKE = 0.9  # of the best: a multiple of the right number informs no better
-_CLEARLY, _LEAST = 1.4, 0.02  # times as much as the expected number, and nats more
+_ALIKE = 0.9  # of the best information: multiples of the right number do no better
+_CLEARLY, _LEAST = 1.4, 0.02  # factor and nats by which another number has to beat the expected one
 _CHUNK = 1_000_000  # rows
 
 
 def read_text(path: Path) -> Cloud:
-    """Read x, y and z (metres) from text, in the first three columns or those that a line of titles names.
+    """Read x, y and z (metres) from text, in the first three columns or those that a title line names.
 
-    Spaces, tabs, commas or semicolons separate the columns. Skipped are further columns, lines that begin with #, // or
-    ;, and the number of points at the start of a PTS file. CloudError names a line that is no point.
+    Spaces, tabs, commas or semicolons separate the columns. Other columns, lines that begin with #, // or ;, and the
+    numbers of points in a PTS file are skipped. CloudError names a line that is no point.
     """
     builder = CloudBuilder()
     try:
@@ -71,7 +71,7 @@ def _opened(path: Path) -> TextIO:
 
 
 class _Unpacked(io.RawIOBase):
-    """Bytes of a gzip file, not more than a text of points can have."""
+    """Bytes of a gzip file, no more than a text of points of its size can have."""
 
     def __init__(self, path: Path) -> None:
         self._file, self._path = gzip.GzipFile(path), path
@@ -127,9 +127,9 @@ def _begin(path: Path, stream: TextIO) -> tuple[str | None, tuple[int, ...], lis
 
 
 def _numbers(path: Path, rows: list[str], separator: str | None, columns: tuple[int, ...], number: int) -> Floats:
-    """Return (N, 3) of lines, without blank lines, comments, and a PTS file's numbers of points."""
+    """Parse lines to points (N, 3), except blank lines, comments, and a PTS file's numbers of points."""
     counted = suffix_of(path).startswith(".pts")
-    # not stripped: an empty first cell of a row of tabs is a column, too
+    # rows are not stripped, as an empty first cell between tabs is a column too
     rows = [
         "" if (text := row.strip()).startswith(_COMMENTS) or (counted and text.isdecimal()) else row for row in rows
     ]
@@ -154,7 +154,7 @@ def _numbers(path: Path, rows: list[str], separator: str | None, columns: tuple[
 
 
 def _titled_columns(text: str) -> tuple[int, ...] | None:
-    """Return the columns of x, y and z in a line of titles; None if it does not name all three."""
+    """Return the columns of x, y and z in a title line; None if it does not name all three."""
     words = [re.sub(r"\(.*?\)|\[.*?\]|[^a-z]", "", word.lower()) for word in re.split(r"[\s,;]+", text.strip()) if word]
     columns: dict[int, int] = {}
     for column, word in enumerate(words):
@@ -172,7 +172,7 @@ def _is_number(text: str) -> bool:
 
 
 def read_npy(path: Path) -> Cloud:
-    """Read an (N, 3 or more) array of numbers whose first three columns are x, y and z in metres; CloudError if not."""
+    """Read an array (N, 3 or more) with x, y and z in metres in the first three columns; CloudError if it is none."""
     try:
         array = np.load(path, mmap_mode="r", allow_pickle=False)
     except MemoryError:
@@ -192,10 +192,10 @@ def read_npy(path: Path) -> Cloud:
 
 
 def read_bin(path: Path) -> Cloud:
-    """Read KITTI's rows, little-endian float32 x, y, z, intensity; ``.pcd.bin``: nuScenes', with a fifth column.
+    """Read rows of little-endian float32: KITTI's x, y, z, intensity, or nuScenes' ``.pcd.bin`` with a fifth column.
 
     Raises:
-        CloudError: the size is no multiple of a row, or the numbers look like rows of another length.
+        CloudError: the size is not a multiple of a row, or the numbers look like rows of another length.
     """
     nuscenes = path.name.lower().endswith(".pcd.bin")
     columns = _NUSCENES_COLUMNS if nuscenes else _KITTI_COLUMNS
@@ -221,9 +221,9 @@ def read_bin(path: Path) -> Cloud:
 def likely_columns(values: Floats32, expected: int) -> int:
     """Guess the number of columns in a file of float32 rows.
 
-    The right number maximises the mutual information of column and value: heights, intensities and rings are
-    distributed unlike x and y; with a wrong row length every column mixes all of them, in any order of the rows.
-    ``expected`` unless another number is clearly better.
+    The right number maximises the mutual information of column and value, because heights, intensities and rings have
+    other distributions than x and y, and with a wrong row length every column mixes all of them. Returns ``expected``
+    unless another number is clearly better.
     """
     values = values[:_JUDGED]
     values = values[: len(values) // _COMMON_ROW * _COMMON_ROW]

@@ -1,4 +1,4 @@
-"""Surveys in feet: metres of their units, and the same reference system in metres."""
+"""Surveys in feet: their units in metres, and the same reference system in metres."""
 
 from __future__ import annotations
 
@@ -14,9 +14,9 @@ from coview_stream.geometry.arrays import Floats, Reals
 
 US_FOOT = 1200 / 3937  # metres
 UNITS = {"feet": FOOT, "us-feet": US_FOOT}
-"""Metres by the names that stand for a system where none is known."""
+"""Metres per unit, by the names for surveys of an unknown system."""
 
-_KEYS = {9001: 1.0, 9002: FOOT, 9003: US_FOOT}  # metres by the GeoTIFF code of a unit
+_KEYS = {9001: 1.0, 9002: FOOT, 9003: US_FOOT}  # metres per unit, by its GeoTIFF code
 _NAMES = {"foot": "feet", "US survey foot": "US survey feet"}
 
 
@@ -25,8 +25,8 @@ class SurveyUnit:
     """Unit of a survey that is not in metres.
 
     Attributes:
-        name: for people.
-        metres: of a unit of x, y and z.
+        name: name for people.
+        metres: metres per unit of x, y and z.
         crs: the survey's system, in metres; None if it has none.
     """
 
@@ -40,9 +40,9 @@ class SurveyUnit:
 
 
 def unit_of_system(text: str | None, keys: Mapping[int, int] | None = None) -> SurveyUnit | None:
-    """Return the unit of a system and of GeoTIFF keys; None if it is the metre, or not known.
+    """Return the unit that a system or GeoTIFF keys state; None if it is the metre, or not known.
 
-    Heights without a unit of their own are in that of the plane.
+    Heights without a unit of their own have the unit of x and y.
     """
     if text in UNITS:
         name = "US survey feet" if text == "us-feet" else "feet"
@@ -59,7 +59,7 @@ def unit_of_system(text: str | None, keys: Mapping[int, int] | None = None) -> S
     axes = parts[0].axis_info
     plane = axes[0].unit_conversion_factor
     if linear not in (None, plane):
-        return None  # a contradiction
+        return None  # contradictory
     heights = [*axes[2:], *(axis for part in parts[1:] for axis in part.axis_info)]
     up = heights[0].unit_conversion_factor if heights else vertical or plane
     if (plane, up) == (1.0, 1.0):
@@ -70,7 +70,7 @@ def unit_of_system(text: str | None, keys: Mapping[int, int] | None = None) -> S
 
 
 def _in_metres(system: Any) -> str:
-    """Return the WKT of a system whose coordinates are multiplied by the metres of their units."""
+    """Return the WKT of a system after conversion of its coordinates to metres."""
     import pyproj
 
     whole = system.source_crs if system.is_bound and system.source_crs is not None else system
@@ -85,7 +85,7 @@ def _in_metres(system: Any) -> str:
 
 
 class InMetres(CloudBuilder):
-    """Builder that hands chunks in another unit to a builder, in metres."""
+    """Builder that converts chunks to metres for another builder."""
 
     def __init__(self, builder: CloudBuilder, unit: SurveyUnit) -> None:
         super().__init__()

@@ -1,4 +1,4 @@
-"""Trajectories as text: TUM (``t x y z qx qy qz qw``) and KITTI (3x4 rows, with separate times)."""
+"""Trajectories as text: TUM (``t x y z qx qy qz qw``) and KITTI (3x4 matrices, with separate times)."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ def read_tum(path: str | os.PathLike[str]) -> tuple[Floats, Poses]:
 
 
 def read_kitti_poses(path: str | os.PathLike[str]) -> Poses:
-    """Read poses (N, 4, 4) from a KITTI file, 12 numbers a line; RunError as ``read_tum``, also for no rotation."""
+    """Read poses (N, 4, 4) from a KITTI file, 12 numbers per line; RunError as in ``read_tum``, or for no rotation."""
     path = Path(path)
     rows, lines = _read_rows(path, 12, "the 3x4 pose, row by row")
     parts = rows.reshape(-1, 3, 4)
@@ -57,7 +57,7 @@ def read_kitti_poses(path: str | os.PathLike[str]) -> Poses:
 
 
 def read_times(path: str | os.PathLike[str]) -> Floats:
-    """Read stamps (N,) in seconds, one a line, increasing; RunError as ``read_tum``."""
+    """Read increasing stamps (N,) in seconds, one per line; RunError as in ``read_tum``."""
     path = Path(path)
     rows, lines = _read_rows(path, 1, "one stamp in seconds")
     check_stamps(rows[:, 0], lines, path)
@@ -65,7 +65,7 @@ def read_times(path: str | os.PathLike[str]) -> Floats:
 
 
 def write_tum(path: str | os.PathLike[str], stamps: Sequence[float] | Floats, poses: Sequence[Pose] | Poses) -> None:
-    """Write stamps (N,) in seconds and poses (N, 4, 4) in metres; the file is complete or not there.
+    """Write stamps (N,) in seconds and poses (N, 4, 4) in metres, atomically.
 
     InputError if the lengths differ, or the file cannot be written.
     """
@@ -102,7 +102,7 @@ def columns_of(path: Path) -> int:
 
 
 def _words(path: Path) -> list[tuple[int, list[str]]]:
-    """Return (line number, words) of all lines but blank ones and comments."""
+    """Return (line number, words) of all lines except blank lines and comments."""
     try:
         text = path.read_bytes().decode("ascii")
     except FileNotFoundError as error:

@@ -1,1 +1,1 @@
-"""Fusion of localized runs with the base map: one cloud, tagged by source and by change."""
+"""Fusion of localized runs with the base map: one cloud, with tags for source and change."""

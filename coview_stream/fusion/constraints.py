@@ -1,4 +1,4 @@
-"""Constraints of a joint adjustment: submaps registered to the base map, and to each other where they overlap."""
+"""Constraints of a joint adjustment: submaps registered to the base map, and overlapping submaps to each other."""
 
 from __future__ import annotations
 
@@ -24,28 +24,28 @@ from coview_stream.localization.registration.register import register, registrat
 from coview_stream.localization.tracking.batch_graph import Constraint
 from coview_stream.localization.tracking.shared_error import SharedErrorModel
 
-STEP = 4.0  # metres driven from keyframe to keyframe
-_REACH = 2.0  # metres driven before and after it, of its frames
-_EVERY = 0.5  # metres between these frames
+STEP = 4.0  # metres driven between keyframes
+_REACH = 2.0  # metres driven before and after a keyframe within which frames join its submap
+_EVERY = 0.5  # metres driven between these frames
 _VOXEL = 0.2  # metres
 _NEAR, _FAR = 1.5, 50.0  # metres from the lidar
-_NEIGHBOURS, _RADIUS = 20, 1.0  # of normals
+_NEIGHBOURS, _RADIUS = 20, 1.0  # for normals; metres
 
 AGREE = 3.0
 """Sigmas per degree of freedom up to which two poses agree; chosen by hand, like the next."""
-_SIGMAS = np.array([np.radians(3.0)] * 3 + [0.7] * 3)  # of the initial poses of a registration
+_SIGMAS = np.array([np.radians(3.0)] * 3 + [0.7] * 3)  # radians and metres, prior on a registration's initial pose
 _SCALES = (1.6, 0.8, 0.4)  # metres
-_APART = 10.0  # largest distance of two registered keyframes, metres
-_LOOP = 30.0  # least metres driven between two keyframes of one run
-_OTHERS = 2  # most keyframes of another run to register one to
-_ON_MAP, _ON_SUBMAP = 0.1, 0.3  # least shares of the points with a partner
+_APART = 10.0  # largest distance between two registered keyframes, metres
+_LOOP = 30.0  # least metres driven between two registered keyframes of one run
+_OTHERS = 2  # keyframes per run to which a keyframe is registered, at most
+_ON_MAP, _ON_SUBMAP = 0.1, 0.3  # least inlier shares
 _MATCH = 0.5  # largest distance between points of one surface, metres
-_FLAT = 0.5  # least planarity of a surface to measure distances from
+_FLAT = 0.5  # least planarity of a surface from which distances are measured
 
 
 @dataclass(frozen=True, eq=False)
 class Submap:
-    """One keyframe and the points around it, about the body, along the map's axes by the poses of ``locate``."""
+    """A keyframe and the points around it, relative to the body, with the map's axes by the poses of ``locate``."""
 
     run: int  # number of the run, from 0
     index: int  # of the keyframe among the run's frames with a pose
@@ -57,17 +57,17 @@ class Submap:
 
     @property
     def T_submap_body(self) -> Pose:
-        """(4, 4), a turn alone."""
+        """Rotation (4, 4) of the body."""
         return pose_from(self.T_map_body[:3, :3], np.zeros(3))
 
     @cached_property
     def source(self) -> RegistrationCloud:
-        """The points, prepared for registration."""
+        """The points, prepared as a registration's source."""
         return prepare_scan(self.points, np.zeros(3), RegistrationConfig())
 
     @cached_property
     def target(self) -> LocalMap | None:
-        """The points as a registration's target; None where they are too few."""
+        """The points as a registration's target; None if there are too few."""
         if len(self.points) < MIN_PAIRS:
             return None
         normals, planarity = estimate_normals(self.points, _NEIGHBOURS, _RADIUS)
@@ -75,7 +75,7 @@ class Submap:
 
 
 def submaps_of(run: LocalizedRun, number: int, origin: Floats) -> list[Submap]:
-    """Return the submaps of run ``number`` in order, on a map with ``origin`` (3,); each frame is read once at most."""
+    """Return the submaps of run ``number`` in order, on a map with ``origin`` (3,); no frame is read twice."""
     odometry = run.odometry
     driven, turned = path_of(odometry)
     wanted = np.zeros(len(run), dtype=bool)
@@ -109,7 +109,7 @@ def path_of(poses: Floats) -> tuple[Floats, Floats]:
 
 
 def spaced(driven: Floats, step: float) -> Ints:
-    """Return indices into metres driven (K,): the first, others ``step`` or more apart, and a last over half a step."""
+    """Choose indices into metres driven (K,), ``step`` or more apart, and the last one if over half a step away."""
     chosen = [0]
     for k in range(1, len(driven)):
         if driven[k] - driven[chosen[-1]] >= step:
@@ -129,9 +129,9 @@ class Registrar:
         self._config = RegistrationConfig()
 
     def to_map(self, k: int) -> Constraint | None:
-        """Register submap ``k`` to the base map from the pose of ``locate``; None where too little is alike.
+        """Register submap ``k`` to the base map from the pose of ``locate``; None if the inlier share is too small.
 
-        Where both agree the pose is that by ``locate``, which knows the registrations of all earlier frames.
+        If both poses agree, the constraint takes the pose of ``locate``, which includes all earlier registrations.
         """
         T_located = self.submaps[k].T_map_body
         target = self._maps.around(T_located[:3, 3])
@@ -141,7 +141,7 @@ class Registrar:
         return replace(constraint, T=T_located)
 
     def to_submap(self, k: int, other: int) -> Constraint | None:
-        """Register submap ``k`` to another from the poses of ``locate``; None where too little is alike."""
+        """Register submap ``k`` to another from the poses of ``locate``; None if the inlier share is too small."""
         target = self.submaps[other].target
         T_start = inverse(self.submaps[other].T_map_body) @ self.submaps[k].T_map_body
         back = self.submaps[other].T_submap_body
@@ -189,14 +189,14 @@ class Registrar:
 
 
 def off_by(constraint: Constraint, T: Pose) -> float:
-    """Return the sigmas, per degree of freedom, between a pose (4, 4) and a constraint."""
+    """Return the distance of a pose (4, 4) from a constraint, sigmas per degree of freedom."""
     gap, R = boxminus(constraint.T, T), constraint.T[:3, :3]
     gap = np.concatenate([gap[:3] @ R, gap[3:] @ R])
     return float(np.sqrt(gap @ np.linalg.solve(constraint.covariance, gap) / 6.0))
 
 
 def overlapping(submaps: Sequence[Submap]) -> list[tuple[int, int]]:
-    """Return pairs of submaps of the same place: nearest submaps of other runs, and loops of the same run."""
+    """Return pairs of submaps at the same place: nearest submaps of other runs, and loops of the same run."""
     places = np.array([submap.T_map_body[:3, 3] for submap in submaps])
     runs = np.array([submap.run for submap in submaps])
     driven = np.array([submap.driven for submap in submaps])

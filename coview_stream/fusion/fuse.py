@@ -1,4 +1,4 @@
-"""Fusing of runs on a base map: one cloud with the source of each point and, on request, the changes."""
+"""Fuse runs with a base map to one cloud with the source of each point and, on request, the changes."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ SAME, NEW, GONE = 0, 1, 2
 """Tags of change."""
 
 RECORD = np.dtype([("x", "<f8"), ("y", "<f8"), ("z", "<f8"), ("stamp", "<f8"), ("source", "<u2"), ("change", "u1")])
-"""A point: metres in the frame of the map's sources, seconds, number of the source, tag of change."""
+"""A point: metres in the frame of the map's sources, seconds, number of the source, change tag."""
 
 
 def records(points: Floats, source: npt.ArrayLike, change: npt.ArrayLike, stamp: npt.ArrayLike) -> npt.NDArray[np.void]:
@@ -35,15 +35,15 @@ def records(points: Floats, source: npt.ArrayLike, change: npt.ArrayLike, stamp:
 
 
 _CELL = 0.5  # metres
-_AROUND = 5  # cells: eaves and crowns hide things within a metre
+_AROUND = 5  # cells: eaves and crowns hide objects within a metre
 _MAX_CELLS = 400_000_000
 
 
 def top_around(base_map: BaseMap, points: Points) -> Floats32:
     """Return the greatest height (N,) of the map around points (N, 3), minus infinity where it has no points.
 
-    A higher object would be in a survey from above; a lower one may have been hidden below a roof or a crown, or be a
-    facade.
+    A survey from above would show a higher object; it may miss a lower one, which is a facade or hidden below a roof
+    or a crown.
     """
     low = np.floor(points[:, :2].min(axis=0).astype(np.float64) - 2.0)
     shape = np.ceil((points[:, :2].max(axis=0).astype(np.float64) + 2.0 - low) / _CELL).astype(int) + 1
@@ -58,7 +58,7 @@ def top_around(base_map: BaseMap, points: Points) -> Floats32:
 
 
 def _within_raster(cells: Floats, raster: npt.NDArray[Any]) -> tuple[Ints, tuple[Ints, ...]]:
-    """Return the rows (M,) of cells (N, 2) within a raster, and these cells as an index."""
+    """Return the rows (M,) of the cells (N, 2) inside a raster, and these cells as an index."""
     inside = np.flatnonzero(((cells >= 0) & (cells < raster.shape)).all(axis=1))
     return inside, tuple(cells[inside].astype(np.int64).T)
 
@@ -67,10 +67,10 @@ Progress = Callable[[int, int, str], None]
 """Called with (frames done, frames, name of the step)."""
 
 _CHUNK = 500_000
-_LOOKS = 3  # through a point, before it counts as absent
-_THROUGH_MOVING, _THROUGH_GONE = 2, 4  # looks through a point per look that ends there
-_NEAR = 0.5  # metres to the map: nearer is the same thing, farther may be a blind spot
-_ABOVE = 0.4  # metres over all that the survey saw around
+_LOOKS = 3  # least looks through a point that is absent
+_THROUGH_MOVING, _THROUGH_GONE = 2, 4  # least looks through such a point per look that ends there
+_NEAR = 0.5  # metres to the map: a nearer point is on the same object, a farther one may fill a blind spot
+_ABOVE = 0.4  # metres above all that the survey saw around a point
 
 
 @dataclass(frozen=True)
@@ -102,30 +102,30 @@ class FuseConfig:
 
 @dataclass(frozen=True)
 class Added:
-    """Contribution of one run: numbers of its frames, and of its points in the fused cloud."""
+    """Contribution of one run: numbers of its frames and of its points in the fused cloud."""
 
     frames: int  # used
     without_pose: int
     damaged: int  # that could not be read
-    points: int  # a voxel of several runs counts for the first of them
+    points: int  # a voxel of several runs counts for the first
 
 
 @dataclass(frozen=True, eq=False)
 class Fused:
-    """The fused cloud; its base map stays in its file until :meth:`chunks` reads it."""
+    """Fused cloud; the points of its base map stay in their file until :meth:`chunks` reads them."""
 
     base_map: BaseMap  # the map
     base_change: npt.NDArray[np.uint8]  # (B,) uint8 tags of the map's points: same, or gone
     points: Points  # (N, 3) float32 of the runs, relative to the map's origin
     source: npt.NDArray[np.uint16]  # (N,) uint16 number of the run, from 1
     change: npt.NDArray[np.uint8]  # (N,) uint8 tag: same, or new
-    stamp: npt.NDArray[np.float64]  # (N,) float64 of the newest frame with the point, seconds
+    stamp: npt.NDArray[np.float64]  # (N,) float64 of the newest frame with a point in the voxel, seconds
     added: tuple[Added, ...]  # by run
-    filled: float  # square metres, about, of new surface in blind spots of the survey
-    moving: int  # voxels apart from the map with rays through them; left out without keep_moving
+    filled: float  # approximate square metres of new surface in blind spots of the survey
+    moving: int  # voxels off the map that rays went through; left out without keep_moving
 
     def __len__(self) -> int:
-        """Return the number of points, the map's included."""
+        """Return the number of points including the map's."""
         return len(self.base_map.points) + len(self.points)
 
     def chunks(self) -> Iterator[npt.NDArray[np.void]]:
@@ -146,12 +146,12 @@ def fuse(
 ) -> Fused:
     """Merge localized runs with the map they were localized on.
 
-    Frames are read for their surfaces, and a few of them again for their rays. Memory holds one row per voxel with
-    points, not the points.
+    Frames are read for their surfaces, and some of them again for their rays. Memory holds one row per occupied voxel,
+    not all points.
 
     Raises:
         InputError: a frame lies too far from the map.
-        CloudError: not one point of the runs is in range.
+        CloudError: no point of the runs is in range.
     """
     config = config or FuseConfig(voxel=base_map.config.voxel)
     table, taken = _surfaces(runs, config, progress)
@@ -205,7 +205,7 @@ def fuse(
 def _surfaces(
     runs: Sequence[LocalizedRun], config: FuseConfig, progress: Progress | None
 ) -> tuple[VoxelTable, list[int]]:
-    """Collect the voxels of all runs, and count their frames by run."""
+    """Collect the voxels of all runs, and count the frames of each run."""
     table, taken = VoxelTable(config.voxel), []
     for source, run in enumerate(runs, start=1):
         count = 0
@@ -240,6 +240,6 @@ def _base_near(base_map: BaseMap, points: Points) -> Ints:
 
 
 def check_count(runs: int) -> None:
-    """Raise ConfigError for more runs than a point's source number can have."""
+    """Raise ConfigError for more runs than a point's source number can count."""
     if runs > np.iinfo(np.uint16).max:
         raise ConfigError(f"{runs} runs: at most 65,535 can be told apart; fuse some of them first")

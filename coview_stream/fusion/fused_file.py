@@ -24,7 +24,7 @@ _PCD_TYPES = {"f8": "8 F", "u2": "2 U", "u1": "1 U"}
 
 
 def check_name(path: Path, inputs: Iterable[Path]) -> None:
-    """Raise CloudError for a name that no cloud can have or an input has, DependencyError for LAS without laspy."""
+    """Raise CloudError for an unknown suffix or the name of an input, DependencyError for LAS without laspy."""
     if path.suffix.lower() not in SUFFIXES:
         raise CloudError(f"{path}: name a cloud, one of {', '.join(SUFFIXES)}")
     if path.is_dir() or not path.resolve().parent.is_dir():
@@ -40,8 +40,8 @@ def write_fused(fused: Fused, path: Path, names: Sequence[str]) -> None:
     """Write the cloud, and next to it ``PATH.json`` with the name of each source.
 
     LAS and LAZ hold millimetres, the source as ``point_source_id``, the stamp as ``gps_time`` and ``change`` as an
-    extra dimension; PLY and PCD have properties ``source``, ``change`` and ``stamp``, and NPY columns x, y, z,
-    stamp, source, change, all float64.
+    extra dimension; PLY and PCD have properties ``source``, ``change`` and ``stamp``; NPY has columns x, y, z, stamp,
+    source, change, all float64.
 
     Raises:
         CloudError: the file cannot be written.
@@ -58,7 +58,7 @@ def write_fused(fused: Fused, path: Path, names: Sequence[str]) -> None:
 
 
 def write_trajectories(path: Path, runs: Sequence[LocalizedRun]) -> list[str]:
-    """Write the poses of each run next to the cloud, TUM, map <- body: ``PATH.run1.tum`` ...; return the names.
+    """Write each run's poses map <- body next to the cloud as ``PATH.run1.tum`` ...; return the names.
 
     Raises:
         InputError: a file cannot be written.
@@ -109,7 +109,7 @@ def _wkt(crs: str | None) -> str | None:
     try:
         systems = require_library("pyproj", "pyproj>=3.6", "reference systems")
         return str(systems.CRS.from_user_input(crs).to_wkt("WKT1_GDAL"))
-    except Exception as error:  # pyproj raises many, and may be missing
+    except Exception as error:  # pyproj may raise anything, or be missing
         warn(f"the cloud does not state its reference system, {crs} ({error})")
     return None
 
@@ -137,7 +137,7 @@ def _plain(stream: BinaryIO, fused: Fused, path: Path) -> None:
 
 
 def summary(fused: Fused, names: Sequence[str], changes: bool) -> str:
-    """Summarize the sources, the blind spots filled and, on request, the changes, a line each."""
+    """Summarize the sources, the filled blind spots and, on request, the changes, one line each."""
     lines = [f"{'0 base map':<18} {len(fused.base_map.points):,} points"]
     for k, (name, added) in enumerate(zip(names, fused.added, strict=True), start=1):
         left = [

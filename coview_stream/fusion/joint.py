@@ -1,10 +1,11 @@
-"""Joint adjustment: the poses of several runs, from their registrations to the map, to each other, and odometry.
+"""Joint adjustment of the poses of several runs by registrations to the map, registrations to each other, and odometry.
 
-The unknowns are the poses of keyframes, 4 m apart. With e(A, B) = log(A^-1 B), they become the most probable ones given
+The unknowns X_k are the poses of keyframes, 4 m apart. With e(A, B) = log(A^-1 B), the solution is the most probable
+given
 
 * registrations to the map: e(Y_k, X_k) ~ N(0, R_k)
-* odometry within a run: e(Z_k, X_{k-1}^-1 X_k) ~ N(0, Q_k), Q measured from the registrations, as while tracking
-* registrations of overlapping submaps, of two runs or of two times of one: e(Z_jk, X_j^-1 X_k) ~ N(0, R_jk)
+* odometry within a run: e(Z_k, X_{k-1}^-1 X_k) ~ N(0, Q_k), Q estimated from the registrations, as in tracking
+* registrations of overlapping submaps, from two runs or from one run at two times: e(Z_jk, X_j^-1 X_k) ~ N(0, R_jk)
 
 all under Cauchy's kernel. Held-out pairs of submaps decide whether the result is better.
 """
@@ -28,23 +29,23 @@ from coview_stream.localization.tracking.batch_graph import BatchGraph, Constrai
 from coview_stream.localization.tracking.motion import DriftEstimator, worth_learning
 
 # chosen by hand
-_KERNEL = 3.0  # sigmas, of Cauchy's weights
+_KERNEL = 3.0  # sigmas, scale of Cauchy's weights
 _ANYWHERE = np.array([np.radians(10.0)] * 3 + [3.0] * 3)  # sigmas of a pose without other constraints
-_HELD_OUT = 4  # one of so many pairs is held out to judge the result
+_HELD_OUT = 4  # every fourth pair is held out to judge the result
 _MIN_HELD_OUT = 3
-_MAP_WORSE, _MAP_ROUNDING = 1.05, 0.002  # largest growth of the distance to the map: factor and metres
+_MAP_WORSE, _MAP_ROUNDING = 1.05, 0.002  # factor and metres by which the distance to the map may grow
 
 
 @dataclass(frozen=True)
 class Judgement:
-    """Medians of distances between surfaces before and after, metres; NaN where there are none."""
+    """Median distances between surfaces before and after the adjustment, metres; NaN if there are none."""
 
     runs: tuple[float, float]  # between held-out submaps
     to_map: tuple[float, float]  # between submaps and the base map
 
     @property
     def better(self) -> bool:
-        """Runs agree better, and no worse with the map."""
+        """Whether runs agree better with each other, and no worse with the map."""
         allowed = _MAP_WORSE * self.to_map[0] + _MAP_ROUNDING
         return self.runs[1] < self.runs[0] and not self.to_map[1] > allowed
 
@@ -57,16 +58,16 @@ class Joint:
     adjusted: tuple[Poses, ...]
     keyframes: int
     on_map: int  # registrations
-    odometry: int  # steps from keyframe to keyframe
-    between: int  # used pairs of submaps of two runs
-    loops: int  # used pairs of submaps of one run
-    held_out: int  # pairs to judge the result by
-    residuals: tuple[float, float]  # median of |e| in sigmas of the used pairs: before, after
-    judgement: Judgement | None  # None with too few pairs to judge by
+    odometry: int  # steps between keyframes
+    between: int  # used pairs of submaps from two runs
+    loops: int  # used pairs of submaps from one run
+    held_out: int  # pairs that judge the result
+    residuals: tuple[float, float]  # median |e| of the used pairs before and after, sigmas
+    judgement: Judgement | None  # None if too few pairs are held out
 
     @property
     def accepted(self) -> bool:
-        """Whether the adjusted poses are better, judged by the held-out overlaps."""
+        """Whether the held-out overlaps show that the adjusted poses are better."""
         return self.judgement is not None and self.judgement.better
 
     @property
@@ -75,7 +76,7 @@ class Joint:
         return self.adjusted if self.accepted else self.located
 
     def said(self) -> str:
-        """Describe the result in lines."""
+        """Describe the result in a few lines."""
         first = (
             f"{'joint':<18} {self.keyframes} keyframes, {self.on_map} on the map, {self.odometry} by odometry, "
             f"{self.between} between runs, {self.loops} loops"
@@ -102,10 +103,10 @@ def adjust(
     """Adjust the poses of runs jointly; the runs stay unchanged.
 
     Args:
-        base_map: the map of their localization.
-        runs: one or more.
+        base_map: the map on which the runs were localized.
+        runs: one or more runs.
         progress: called after each step.
-        relative: use registrations between submaps; False for a comparison with the map and odometry alone.
+        relative: use registrations between submaps; False compares with the map and odometry alone.
 
     Raises:
         CloudError: a frame cannot be read.
@@ -150,9 +151,9 @@ def adjust(
 
 
 def _odometry(submaps: Sequence[Submap], on_map: Sequence[Constraint]) -> list[Constraint]:
-    """Return the steps of odometry, with the drift by the run's registrations to the map.
+    """Return odometry's steps, with the drift estimated from the run's registrations to the map.
 
-    Where an end has no registration, the step is that of ``locate`` unless it jumps there.
+    If an end has no registration, the step of ``locate`` is used unless it jumps there.
     """
     config = LocalizerConfig().tracking
     registered = {constraint.source: constraint for constraint in on_map}
@@ -189,7 +190,7 @@ def _solved(submaps: Sequence[Submap], on_map: Sequence[Constraint], relative: S
 
 
 def _residual(constraints: Sequence[Constraint], poses: Floats) -> float:
-    """Median of the whitened differences between submaps, in sigmas per degree of freedom."""
+    """Return the median whitened residual between submaps, sigmas per degree of freedom."""
     if not constraints:
         return float("nan")
     return float(np.median([off_by(c, inverse(poses[c.target]) @ poses[c.source]) for c in constraints]))
@@ -204,7 +205,7 @@ def _medians(apart: Callable[[Floats], list[Floats]], before: Floats, after: Flo
 
 
 def _spread(run: LocalizedRun, number: int, submaps: Sequence[Submap], poses: Floats, origin: Floats) -> Poses:
-    """Return poses (K, 4, 4) of all frames: moves of the keyframes around, interpolated by metres driven."""
+    """Return poses (K, 4, 4) of all frames, moved like the keyframes around, interpolated by metres driven."""
     driven, _ = path_of(run.odometry)
     keys = [k for k, submap in enumerate(submaps) if submap.run == number]
     at = np.array([submaps[k].driven for k in keys])

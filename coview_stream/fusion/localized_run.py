@@ -23,7 +23,7 @@ from coview_stream.localization.frame import OdometryCorrection
 from coview_stream.localization.smoothing import PoseKind
 from coview_stream.recordings.run import Run
 
-_SAME_STAMP = 5e-4  # seconds; trajectories have microseconds, frames are milliseconds apart at least
+_SAME_STAMP = 5e-4  # seconds; trajectories have microseconds, and frames are at least milliseconds apart
 _MAX_RESULT = 1 << 28  # bytes of a result.json
 
 
@@ -32,7 +32,7 @@ class RunPair:
     """A recorded run and the results of ``locate`` for it."""
 
     run: Path  # path of the run
-    out: Path  # directory that locate wrote, or a trajectory (TUM, map <- body)
+    out: Path  # output directory of locate, or a trajectory (TUM, map <- body)
 
     @property
     def trajectory(self) -> Path:
@@ -46,7 +46,7 @@ class RunPair:
 
 
 def parse_pair(text: str) -> RunPair:
-    """Read ``RUN:OUT``; InputError unless exactly one way to split the text at a colon names existing paths."""
+    """Parse ``RUN:OUT``; InputError unless exactly one split of the text at a colon gives two existing paths."""
     ways = [k for k, letter in enumerate(text) if letter == ":" and 0 < k < len(text) - 1]
     if not ways:
         raise InputError(f"{text}: write RUN:OUT, the run and the results of `coview-stream locate RUN -o OUT`")
@@ -72,11 +72,11 @@ class PosedFrame:
 
 
 class LocalizedRun:
-    """Run with poses on the map; frames are read on demand. A pose that was bridged by odometry alone counts as none.
+    """Run with poses on the map; frames are read on demand. Poses bridged by odometry alone are left out.
 
     Attributes:
-        pair: its paths.
-        stamps: (K,) of the frames with a pose, seconds.
+        pair: paths of the run and of its results.
+        stamps: (K,) stamps of the frames with a pose, seconds.
         poses: (K, 4, 4) map <- body, in the coordinates of the map's sources.
         without_pose: number of frames without a pose.
         damaged: indices of frames that could not be read so far.
@@ -87,7 +87,7 @@ class LocalizedRun:
     ) -> None:
         """Read the results, then open the run with ``open_it`` (its path, the mount of ``locate``).
 
-        Where the results do not have the seconds that clouds are stamped later than odometry, ``cloud_delay`` is taken.
+        ``cloud_delay``, the seconds by which clouds are stamped later than odometry, is for results that lack it.
 
         Raises:
             InputError: the results are of another map, no frame has a pose, or files cannot be read.
@@ -123,23 +123,23 @@ class LocalizedRun:
             raise InputError(f"{pair.trajectory}: holds poses: {why}; leave it out, or name the right run")
 
     def __len__(self) -> int:
-        """Return the number of frames that have a pose."""
+        """Return the number of frames with a pose."""
         return len(self._index)
 
     @property
     def odometry(self) -> Poses:
-        """Odometry (K, 4, 4) of these frames, metres, with the last correction by ``locate`` of scale and heading."""
+        """Odometry (K, 4, 4) of these frames, metres, with the last correction of scale and heading by ``locate``."""
         correction = OdometryCorrection()
         corrected = np.array([correction.correct(T, self._calibration) for T in self._run.poses])
         return np.asarray(corrected[self._index])
 
     @property
     def notes(self) -> tuple[str, ...]:
-        """Remarks of the run's reader, a line each."""
+        """Remarks of the run's reader, one line each."""
         return self._run.notes
 
     def frames(self, wanted: Callable[[int], bool] | None = None) -> Iterator[PosedFrame | None]:
-        """Yield the frames with a pose, in order; None for damaged frames and those that ``wanted`` refuses."""
+        """Yield the frames with a pose, in order; None for damaged frames and frames that ``wanted`` refuses."""
         lever = np.zeros(3) if self._run.mount is None else self._run.mount.T_body_sensor[:3, 3]
         history = OdometryHistory.of(self._run.stamps, self._run.poses)
         since = history.since_clouds(self.stamps, self._calibration.delay, self._calibration.scale)
@@ -155,7 +155,7 @@ class LocalizedRun:
                 continue
             finite = frame.points[np.isfinite(frame.points).all(axis=1)]
             points = self._calibration.level(finite)
-            # a single scan may be stored far from its zero: the pose is in the file's coordinates
+            # a single scan may lie far from the zero of its file, and the pose is in the file's coordinates
             T = self.poses[k] @ inverse(since[k]) @ pose_from(np.eye(3), frame.origin)
             T[:3, 3] -= self._origin
             eye = transform(self._calibration.T_body_cloud, lever[None])[0]
@@ -163,7 +163,7 @@ class LocalizedRun:
 
 
 def _matched(frames: Floats, stamps: Floats) -> tuple[Any, Any]:
-    """Return indices of frames and of poses with the same stamp."""
+    """Return the indices of frames and poses with equal stamps."""
     if not len(stamps):
         return np.zeros(0, dtype=np.int64), np.zeros(0, dtype=np.int64)
     after = np.clip(np.searchsorted(stamps, frames), 1, max(len(stamps) - 1, 1))
@@ -175,7 +175,7 @@ def _matched(frames: Floats, stamps: Floats) -> tuple[Any, Any]:
 
 
 def _bridged(stamps: Floats, result: dict[str, Any]) -> Bools:
-    """Tell which poses (N,) lie in a stretch that ``locate --smooth`` bridged."""
+    """Mask the poses (N,) in stretches that ``locate --smooth`` bridged."""
     stretches, bridged = result.get("smoothed"), np.zeros(len(stamps), dtype=bool)
     for stretch in stretches if isinstance(stretches, list) else ():
         if isinstance(stretch, dict) and stretch.get("kind") == PoseKind.BRIDGED:
@@ -215,7 +215,7 @@ def _part(result: dict[str, Any], name: str) -> dict[str, Any]:
 
 
 def _mount(values: dict[str, Any]) -> Mount:
-    """Read :meth:`Mount.to_json`, also as earlier versions wrote it: radians, names without units."""
+    """Read :meth:`Mount.to_json`, also in the form of earlier versions: radians, names without units."""
     angles, metres = ("roll", "pitch", "yaw"), ("x", "y", "z")
     roll, pitch, yaw = (math.radians(_number(values, f"{name}_deg")) or _number(values, name) for name in angles)
     x, y, z = (_number(values, f"{name}_m") or _number(values, name) for name in metres)

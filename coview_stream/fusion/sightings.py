@@ -1,4 +1,4 @@
-"""Sightings of points: counts of rays that end at them or go through them, and look-ups of points."""
+"""Sightings: counts of rays that end at points or go through them; voxel tables and look-ups of points."""
 
 from __future__ import annotations
 
@@ -14,12 +14,12 @@ from coview_stream.geometry.rasters import by_square, min_filter
 from coview_stream.geometry.transforms import Points
 
 REACH = 25.0
-"""Metres within which rays count: farther off, neighbouring rays miss things between them."""
+"""Metres within which rays count; farther away, objects fit between neighbouring rays."""
 
-_PIXEL = np.radians(0.5)  # of the range image; 0.2 m at the reach
+_PIXEL = np.radians(0.5)  # of the range image; 0.2 m at ``REACH``
 _COLUMNS, _ROWS = 720, 361
 _NEAREST, _STEEPEST = 1.5, np.radians(70.0)
-_TILE = 8.0  # metres, of the look-up of points
+_TILE = 8.0  # metres, for the look-up of points
 
 
 Counts = npt.NDArray[np.uint32]
@@ -28,18 +28,18 @@ Counts = npt.NDArray[np.uint32]
 class Sightings:
     """Counts of the sightings of fixed points.
 
-    A ray goes through a point if it and all rays in the pixels around end well behind it; a ray that grazes the ground
-    or an edge does not count.
+    A look goes through a point if its ray and all rays in neighbouring pixels end well behind the point. Rays that
+    graze the ground or an edge therefore do not count.
 
     Attributes:
-        points: (N, 3) relative to the map's origin, sorted by tile.
-        order: (N,) indices of these points among the given ones.
-        through: (N,) looks through the point.
-        seen: (N,) looks that ended there.
+        points: (N, 3) metres relative to the map's origin, sorted by tile.
+        order: (N,) indices of these points among the given points.
+        through: (N,) number of looks through the point.
+        seen: (N,) number of looks that end at the point.
     """
 
     def __init__(self, points: Points, margin: float) -> None:
-        """Count for points (N, 3) relative to the map's origin; a ray through one ends ``margin`` metres behind it."""
+        """Take points (N, 3) relative to the map's origin; a ray through one ends ``margin`` metres or more behind."""
         self.order, self._tiles, self._begin = by_square(points, _TILE)
         self.points = points[self.order]
         self._margin = margin
@@ -47,9 +47,9 @@ class Sightings:
         self.seen = np.zeros(len(points), dtype=np.uint32)
 
     def look(self, frame: PosedFrame) -> None:
-        """Count the rays of one frame at the points around it."""
+        """Count the looks of one frame at the points around it."""
         pixel, far, valid = _pixels(frame.points - frame.eye.astype(np.float32))
-        ranges = np.full((_ROWS, _COLUMNS), np.inf, dtype=np.float32)  # shortest by pixel
+        ranges = np.full((_ROWS, _COLUMNS), np.inf, dtype=np.float32)  # shortest range per pixel
         np.minimum.at(ranges.reshape(-1), pixel[valid], far[valid])
         wide = np.concatenate([ranges[:, -1:], ranges, ranges[:, :1]], axis=1)
         nearest = min_filter(wide, 3)[:, 1:-1]
@@ -67,7 +67,7 @@ class Sightings:
             self.seen[stretch] += valid & (np.abs(around - far) <= margin)
 
     def given(self, counts: Counts) -> Counts:
-        """Return counts (N,), ordered by the points given."""
+        """Return counts (N,) in the order of the given points."""
         out = np.empty_like(counts)
         out[self.order] = counts
         return out
@@ -82,7 +82,7 @@ def _pixels(rays: Points) -> tuple[Ints, Floats32, Bools]:
 
 
 def looks_at(stamps: Floats, positions: Floats) -> Bools:
-    """Choose frames (K,) to look from: half a metre or a second after the previous chosen frame."""
+    """Mask the frames (K,) to look from, half a metre or a second apart."""
     chosen = np.zeros(len(stamps), dtype=bool)
     last = -1
     for k in range(len(stamps)):
@@ -97,11 +97,11 @@ _HALF = 1 << (_BITS - 1)
 _BUFFER = 2_000_000  # rows to merge later: 100 MB
 
 ROW = np.dtype([("key", "<i8"), ("hits", "<u4"), ("sum", "<f4", 3), ("stamp", "<f8"), ("source", "<u2")])
-"""A voxel: key, number of frames with a point in it, sum of these points from its corner, newest stamp, first run."""
+"""A voxel: key, number of frames with a point in it, sum of these points from its corner, last stamp, first run."""
 
 
 class VoxelTable:
-    """Table of voxels of an edge in metres; one point per frame and voxel counts."""
+    """Table of voxels of edge ``voxel``, metres; counts one point per frame and voxel."""
 
     def __init__(self, voxel: float) -> None:
         self.voxel = voxel
@@ -115,7 +115,7 @@ class VoxelTable:
         return len(self._rows)
 
     def add(self, points: Points, stamp: float, source: int) -> None:
-        """Add a frame's points (N, 3), relative to the map's origin, at most one of each voxel.
+        """Add a frame's points (N, 3), relative to the map's origin, at most one per voxel.
 
         Raises:
             InputError: a point is too far from the map.
@@ -160,25 +160,25 @@ class VoxelTable:
 
 
 def keys_of(cells: Floats) -> Ints:
-    """Return one number (N,) for each voxel (N, 3)."""
+    """Return the key (N,) of each voxel (N, 3)."""
     x, y, z = (cells.astype(np.int64) + _HALF).T
     return np.asarray((x << 2 * _BITS) | (y << _BITS) | z)
 
 
 def cells_of(keys: Ints) -> Floats:
-    """Return the voxels (N, 3) of numbers (N,)."""
+    """Return the voxels (N, 3) of keys (N,)."""
     mask = (1 << _BITS) - 1
     parts = [(keys >> 2 * _BITS) & mask, (keys >> _BITS) & mask, keys & mask]
     return np.stack(parts, axis=1).astype(np.float64) - _HALF
 
 
-_TREE_TILE = 50.0  # metres: a tree of points at a time of at most some 100,000
+_TREE_TILE = 50.0  # metres: one search tree at a time, of some 100,000 points at most
 
 
 def distances(points: Points, around: Callable[[Floats, float], Points], reach: float) -> Floats32:
-    """Return the distance (N,) of points (N, 3) to the nearest other one, infinity beyond ``reach``.
+    """Return the distance (N,) of points (N, 3) to the nearest other point, infinity beyond ``reach``.
 
-    ``around`` gives the others within a radius of a place (2,).
+    ``around`` returns the other points within a radius of a position (2,).
     """
     from scipy.spatial import cKDTree
 
@@ -195,7 +195,7 @@ def distances(points: Points, around: Callable[[Floats, float], Points], reach: 
 
 
 def within(points: Points) -> Callable[[Floats, float], Points]:
-    """Return a look-up of points (N, 3) around a place, for :func:`distances`."""
+    """Return a function that finds points (N, 3) around a position, for :func:`distances`."""
     order = np.argsort(points[:, 0], kind="stable")
     x = points[order, 0]
 

@@ -1,4 +1,4 @@
-"""Reports: errors against truth, and pictures that a person can read."""
+"""Reports: errors against the truth, and pictures for people."""
 
 from __future__ import annotations
 

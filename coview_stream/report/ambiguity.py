@@ -23,13 +23,13 @@ from coview_stream.report.plots import (
 )
 
 _LIMITS = {0.0: "#0072B2", 5.0: "#56B4E9", 10.0: "#009E73", 20.0: "#F0E442", 40.0: "#E69F00", math.inf: "#D55E00"}
-"""Metres of driving, and the colour of the stations that are told apart by then: of Okabe and Ito."""
+"""Colours (Okabe and Ito) of the stations that a robot can tell apart after so many metres."""
 
-_AREA = 50.0  # metres: stations this near each other are one part of the site
+_AREA = 50.0  # metres: stations within this distance form one part of the site
 
 
 def summary(result: Ambiguity, base_map: BaseMap) -> str:
-    """Summarize in one line the shares of stations from which a robot is found at once, later, and not."""
+    """Summarize in one line the shares of stations where a robot is found at once, later, or never."""
     if not len(result):
         return "no stations"
     metres = float(np.max(result.drive, initial=0.0, where=np.isfinite(result.drive)))
@@ -50,7 +50,7 @@ def summary(result: Ambiguity, base_map: BaseMap) -> str:
 
 
 def facts(result: Ambiguity, base_map: BaseMap) -> dict[str, Any]:
-    """Return the numbers for JSON; metres in the source's frame, nats; null for a drive that does not end."""
+    """Return the numbers for JSON; metres in the source's frame, nats; null for a robot that is not found."""
     position = result.position + base_map.origin
     stations = [
         {
@@ -73,7 +73,7 @@ def facts(result: Ambiguity, base_map: BaseMap) -> dict[str, Any]:
 
 
 def plot_ambiguity(result: Ambiguity, base_map: BaseMap, path: str | os.PathLike[str], title: str) -> None:
-    """Draw the map in grey, and its stations by how far a robot has to drive from them.
+    """Draw the map in grey, and its stations coloured by the distance that a robot has to drive from them.
 
     Raises:
         InputError: the picture cannot be written.
@@ -104,7 +104,7 @@ def _name(before: float, limit: float) -> str:
 
 
 def _worst(result: Ambiguity, slow: Bools) -> Floats:
-    """Return the middle (2,) of the part of the site with the longest drives."""
+    """Return the centre (2,) of the part of the site with the longest drives."""
     xy, metres = result.position[slow, :2], np.minimum(result.drive[slow], 2.0 * FARTHEST)
     cell = np.unique(np.floor(xy / _AREA), axis=0, return_inverse=True)[1].ravel()
     worst = cell == np.bincount(cell, weights=metres).argmax()
@@ -112,7 +112,7 @@ def _worst(result: Ambiguity, slow: Bools) -> Floats:
 
 
 def _percents(until: Sequence[float]) -> list[str]:
-    """Format the parts of a whole, given the shares up to the end of each, so that they add up; "0 %" means none."""
+    """Format cumulative shares as percentages of the parts that add up; "0 %" means none."""
     parts = zip(np.diff(until, prepend=0.0), np.diff(np.rint(100.0 * np.array(until)), prepend=0.0), strict=True)
     limits = {0.0: "under 1 %", 100.0: "over 99 %"}
     return [limits.get(part, f"{part:.0f} %") if 0.0 < share < 1.0 else f"{part:.0f} %" for share, part in parts]

@@ -17,7 +17,7 @@ from coview_stream.geometry.arrays import Bools, Floats, Indices
 from coview_stream.geometry.transforms import Pose
 
 MAX_ROTATION = float(np.radians(5.0))
-"""A pose is right below this rotation error (eq. 15), radians ..."""
+"""A pose is right below this rotation error (eq. 15), radians, ..."""
 
 MAX_TRANSLATION = 3.0
 """... and below this translation error (eq. 16), metres (the success criterion of eq. 17)."""
@@ -26,7 +26,7 @@ MAX_STAMP_GAP = 0.051
 """Poses farther than this from every true stamp (seconds) are not compared; half a frame at 10 Hz."""
 
 MIN_RIGHT_SHARE = 0.95
-"""A run succeeds if its first pose is right and more than this share of all poses."""
+"""A run succeeds if its first pose is right and more than this share of all poses are right."""
 
 Trajectory = tuple[Floats, Floats]
 """Stamps (N,) in seconds, increasing, and poses (N, 4, 4) in metres, as ``read_tum`` returns them."""
@@ -34,12 +34,12 @@ Trajectory = tuple[Floats, Floats]
 
 @dataclass(frozen=True, eq=False)
 class FrameErrors:
-    """Errors of every estimated pose that has a true one."""
+    """Errors of every estimated pose that has a true pose."""
 
     index: Indices
     """(K,) index of the true pose."""
     distance: Floats
-    """(K,) metres driven along the truth up to there."""
+    """(K,) metres driven along the truth up to this pose."""
     e_r: Floats
     """(K,) rotation errors, radians (eq. 15)."""
     e_t: Floats
@@ -47,7 +47,7 @@ class FrameErrors:
 
     @property
     def right(self) -> Bools:
-        """(K,) whether each pose counts as a success (eq. 17)."""
+        """Mask (K,) the poses that count as a success (eq. 17)."""
         return (self.e_r < MAX_ROTATION) & (self.e_t < MAX_TRANSLATION)
 
 
@@ -66,19 +66,19 @@ class Evaluation:
     """Comparison of one run with the truth.
 
     Attributes:
-        frames: true poses.
-        posed: estimated poses that have a true one within ``MAX_STAMP_GAP``.
-        unmatched: estimated poses that have none.
+        frames: number of true poses.
+        posed: number of estimated poses with a true pose within ``MAX_STAMP_GAP``.
+        unmatched: number of estimated poses without a true pose.
         share_localised: share of the frames with a right pose, 0 to 1.
-        false_frames: wrong poses; the number that has to be zero.
+        false_frames: number of wrong poses, which has to be zero.
         first_fix_m: metres driven before the first pose; None if there is none.
-        success: the first pose is right, and more than 95 % of all.
+        success: the first pose is right, and more than 95 % of all poses are.
         translation: errors of the right poses, metres; None if there are none.
         rotation: errors of the right poses, degrees; None if there are none.
-        worst_t_m: largest translation error of all poses, the false ones included, metres.
-        worst_r_deg: largest rotation error of all poses, degrees.
-        origin_t_m: translation error at the origin of the odometry, which the paper reports: the yaw error
-            times the lever arm from there to the robot is part of it. None without ``T_map_odom``.
+        worst_t_m: largest translation error of all poses including false ones, metres.
+        worst_r_deg: largest rotation error of all poses including false ones, degrees.
+        origin_t_m: translation error at the origin of the odometry, as in the paper; includes the yaw error times the
+            lever arm from there to the robot. None without ``T_map_odom``.
     """
 
     frames: int
@@ -115,7 +115,7 @@ def frame_errors(estimate: Trajectory, truth: Trajectory) -> FrameErrors:
 
 
 def _pairs(estimate: Trajectory, truth: Trajectory) -> tuple[Indices, Floats, Floats]:
-    """Return the estimated poses (K, 4, 4) that have a true one near in time, behind its rows (K,), and the true."""
+    """Return row (K,) of the nearest true pose in time, estimated poses (K, 4, 4) that have one, and true poses."""
     (stamps, poses), (true_stamps, true_poses) = estimate, truth
     after = np.clip(np.searchsorted(true_stamps, stamps), 0, len(true_stamps) - 1)
     before = np.maximum(after - 1, 0)
@@ -126,7 +126,7 @@ def _pairs(estimate: Trajectory, truth: Trajectory) -> tuple[Indices, Floats, Fl
 
 
 def constant_offset(estimate: Trajectory, truth: Trajectory) -> str | None:
-    """Say by which shift or transform the truth differs from an estimate that is not empty; None if by none."""
+    """Describe the constant shift or transform between the truth and a non-empty estimate; None if there is none."""
     _, T_est, T_true = _pairs(estimate, truth)
     apart = T_true[:, :3, 3] - T_est[:, :3, 3]
     of_body = np.einsum("nji,nj->ni", T_est[:, :3, :3], apart)
@@ -142,7 +142,7 @@ def constant_offset(estimate: Trajectory, truth: Trajectory) -> str | None:
 
 
 def driven(poses: Floats) -> Floats:
-    """Return (N,) metres driven up to each of the (N, 4, 4) poses."""
+    """Return metres driven (N,) up to each of the poses (N, 4, 4)."""
     steps = np.linalg.norm(np.diff(poses[:, :3, 3], axis=0), axis=1)
     return np.concatenate([[0.0], np.cumsum(steps)])[: len(poses)]
 
@@ -153,7 +153,7 @@ def evaluate(estimate: Trajectory, truth: Trajectory, T_map_odom: tuple[Pose, Po
     Args:
         estimate: stamps and poses ``T_map_body``, only where the robot was localized.
         truth: stamps and poses ``T_map_body`` of every frame.
-        T_map_odom: estimated and true pose of the odometry frame, for ``origin_t_m``.
+        T_map_odom: estimated and true poses of the odometry frame, for ``origin_t_m``.
 
     Raises:
         InputError: the truth holds no pose.

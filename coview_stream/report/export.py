@@ -18,7 +18,7 @@ from coview_stream.errors import ConfigError, InputError
 from coview_stream.geometry.arrays import Floats
 from coview_stream.geometry.transforms import Poses, pose_to_tum
 
-_LATEST = 4e9  # seconds since 1970: stamps outside, or within the first year, are no times of day
+_LATEST = 4e9  # seconds since 1970: later stamps, or stamps within the first year, are no Unix times
 _EARLIEST = 3.2e7
 
 
@@ -32,13 +32,13 @@ class Trajectory:
     poses: Poses
     """(N, 4, 4) map <- body, metres."""
     geodetic: Floats | None = None
-    """(N, 3) latitude, longitude and height; None where the map has no reference system."""
+    """(N, 3) latitude, longitude and height; None if the map has no reference system."""
     kinds: Sequence[str] | None = None
     """(N,) kinds of the poses; None unless they are smoothed."""
 
 
 def csv(trajectory: Trajectory) -> str:
-    """Return one line a pose: stamp, position, quaternion; latitude, longitude, height and kind where known."""
+    """Return one line per pose: stamp, position, quaternion; if known, latitude, longitude, height and kind."""
     titles = "stamp,x,y,z,qx,qy,qz,qw" + ("" if trajectory.geodetic is None else ",latitude,longitude,height")
     titles += "" if trajectory.kinds is None else ",kind"
     lines = [titles]
@@ -54,12 +54,12 @@ def csv(trajectory: Trajectory) -> str:
 
 
 def kitti(trajectory: Trajectory) -> str:
-    """Return one line a pose: the first three rows of map <- body."""
+    """Return one line per pose: the first three rows of map <- body."""
     return "".join(" ".join(f"{v:.9e}" for v in T[:3].ravel()) + "\n" for T in trajectory.poses)
 
 
 def geojson(trajectory: Trajectory) -> str:
-    """Return a line and a point a pose, longitude first (RFC 7946)."""
+    """Return a line and a point for each pose, longitude first (RFC 7946)."""
     places = _geodetic(trajectory)
     coordinates = [[round(lon, 9), round(lat, 9), round(height, 3)] for lat, lon, height in places.tolist()]
     kinds = [{} for _ in coordinates] if trajectory.kinds is None else [{"kind": kind} for kind in trajectory.kinds]
@@ -78,7 +78,7 @@ def geojson(trajectory: Trajectory) -> str:
 
 
 def gpx(trajectory: Trajectory) -> str:
-    """Return a track; a point has a time where its stamp is one since 1970."""
+    """Return a track; a point has a time if its stamp is a Unix time."""
     points = []
     for stamp, (latitude, longitude, height) in zip(trajectory.stamps, _geodetic(trajectory).tolist(), strict=True):
         time = "".join(f"<time>{value}</time>" for value in _time(float(stamp)).values())
@@ -111,10 +111,10 @@ def chosen_formats(text: str) -> tuple[str, ...]:
 
 
 def reference_for(crs: str | None, names: Sequence[str]) -> GeoReference | None:
-    """Return the reference that formats need; None where they do without and the map has none.
+    """Return the reference for formats, None if the map has none and no format needs it.
 
     Raises:
-        InputError, DependencyError: as of :class:`GeoReference`, if one of them cannot do without.
+        InputError, DependencyError: see :class:`GeoReference`; only if a format needs the reference.
     """
     if any(name in ON_EARTH for name in names):
         return GeoReference(crs)
@@ -125,7 +125,7 @@ def reference_for(crs: str | None, names: Sequence[str]) -> GeoReference | None:
 
 
 def export(trajectory: Trajectory, folder: Path, names: Sequence[str]) -> list[Path]:
-    """Write a trajectory into an existing folder, a file a format; return the files."""
+    """Write a trajectory into an existing folder, one file per format; return the files."""
     written = []
     for name in names:
         file, write = FORMATS[name]
@@ -138,7 +138,7 @@ def export(trajectory: Trajectory, folder: Path, names: Sequence[str]) -> list[P
 def trajectory_of(
     name: str, stamps: npt.ArrayLike, poses: npt.ArrayLike, geo: GeoReference | None, kinds: Sequence[str] | None = None
 ) -> Trajectory:
-    """Return the trajectory of poses (N, 4, 4), with their places on Earth if there is a reference."""
+    """Return the trajectory of poses (N, 4, 4), with latitude and longitude if there is a reference."""
     stack = np.asarray(poses, dtype=np.float64).reshape(-1, 4, 4)
     places = None if geo is None else geo.geodetic(stack[:, :3, 3])
     return Trajectory(name, np.asarray(stamps, dtype=np.float64), stack, places, kinds)
@@ -151,7 +151,7 @@ def _geodetic(trajectory: Trajectory) -> Floats:
 
 
 def _time(stamp: float) -> dict[str, str]:
-    """Return the time of day of a stamp, if it is one since 1970."""
+    """Return the time of a stamp, if it is a Unix time."""
     if not _EARLIEST < stamp < _LATEST:
         return {}
     moment = datetime.fromtimestamp(stamp, UTC)

@@ -1,6 +1,6 @@
 """Pictures of maps, trajectories, errors and descriptors, as PNG files.
 
-All take plain arrays, in metres and radians, and work without a display.
+All functions take plain arrays in metres and radians, and work without a display.
 """
 
 from __future__ import annotations
@@ -29,10 +29,10 @@ TRUTH = "#000000"
 ACCENT = "#009E73"
 
 MAX_BASE_POINTS = 1_000_000
-"""A base map is thinned to this many points: more do not show in a picture of 800 cells across."""
+"""A base map is thinned to this many points: more do not show in a picture 800 cells across."""
 
-_UNLIKELY = 0.01  # places that are less probable are not drawn
-_GROUND_WINDOW = 25.0  # metres; terrain changes little over it, and few buildings are wider
+_UNLIKELY = 0.01  # least probability of places that are drawn
+_GROUND_WINDOW = 25.0  # metres; terrain changes little over this distance, and few buildings are wider
 
 _STYLE = {
     "font.family": "DejaVu Sans",
@@ -54,7 +54,7 @@ _STYLE = {
 
 @contextmanager
 def figure(path: str | os.PathLike[str], **options: Any) -> Iterator[tuple[Any, Any]]:
-    """Give a figure and its axes, and save them as ``path`` when the block ends.
+    """Yield a figure and its axes, and save the figure as ``path`` when the block ends.
 
     The Agg canvas is used directly: neither the caller's backend nor pyplot's state is touched.
 
@@ -83,14 +83,14 @@ def figure(path: str | os.PathLike[str], **options: Any) -> Iterator[tuple[Any, 
 def draw_base_map(axes: Any, points: Reals) -> Floats:
     """Draw (N, 3) base map points from above, darker the higher they stand over their surroundings.
 
-    Returns the offset (3,) subtracted from the coordinates: far from zero (UTM) they are shifted by a round number,
-    named in the axis labels; ticks with seven digits cannot be read.
+    Returns the offset (3,) subtracted from the coordinates. Large coordinates (UTM) are shifted by a round number that
+    the axis labels name, because ticks with seven digits are unreadable.
     """
     shift = base_shift(points)
     if len(points):
         sample = np.asarray(points[:: max(1, -(-len(points) // MAX_BASE_POINTS))], dtype=np.float64) - shift
         grey, extent = _shaded(sample)
-        # holes have one colour
+        # one colour for holes
         axes.imshow(grey.T, cmap="gray", vmin=0, vmax=1, origin="lower", extent=extent, interpolation="nearest")
     axes.set_aspect("equal", adjustable="datalim")
     axes.set_xlabel(_axis_label("east", shift[0]))
@@ -104,7 +104,7 @@ def _shaded(points: Floats) -> tuple[Any, tuple[float, float, float, float]]:
 
     low, high = points[:, :2].min(axis=0), points[:, :2].max(axis=0)
     side = np.maximum(high - low, 1.0)
-    # not finer than the picture's pixels, nor than the points lie
+    # no finer than the picture's pixels or the spacing of the points
     cell = max(float(side.max()) / 800.0, float(np.sqrt(side.prod() / len(points))))
     shape = (side / cell).astype(int) + 1
     i, j = ((points[:, :2] - low) / cell).astype(int).T
@@ -122,7 +122,7 @@ def _shaded(points: Floats) -> tuple[Any, tuple[float, float, float, float]]:
 
 
 def map_figure_size(points: Reals) -> tuple[float, float]:
-    """Return width and height of a map's figure, inches: a road corridor needs less height than a square."""
+    """Return width and height of a map's figure, inches; a road corridor needs less height than a square."""
     if not len(points):
         return 8.0, 8.6
     east, north = np.maximum(np.ptp(np.asarray(points[:, :2], dtype=np.float64), axis=0), 1.0)
@@ -132,7 +132,7 @@ def map_figure_size(points: Reals) -> tuple[float, float]:
 
 
 def base_shift(points: Reals) -> Floats:
-    """Return the (3,) round offset to subtract before drawing; zeros where coordinates are short enough to read."""
+    """Return the round offset (3,) to subtract before drawing; zero if the coordinates are short enough to read."""
     if not len(points):
         return np.zeros(3)
     middle = np.median(np.asarray(points, dtype=np.float64), axis=0)
@@ -149,14 +149,14 @@ def _axis_label(name: str, shift: float) -> str:
 
 
 def draw_notice(axes: Any, text: str) -> None:
-    """Write a text across the middle of an empty picture."""
+    """Write a text into the middle of an empty picture."""
     box = {"facecolor": "white", "edgecolor": STATE_COLOURS["LOST"], "boxstyle": "round,pad=0.6"}
     style = {"ha": "center", "va": "center", "fontsize": 13, "fontweight": "bold", "bbox": box}
     axes.text(0.5, 0.5, text, transform=axes.transAxes, **style)
 
 
 def legend_below(drawing: Any, axes: Any, title: str | None = None) -> None:
-    """Put the legend under the picture, where it hides nothing, with marks of one readable size."""
+    """Put the legend below the picture, where it hides nothing, with marks of one readable size."""
     handles, labels = axes.get_legend_handles_labels()
     if handles:
         place = {"loc": "outside lower center", "ncols": 2, "title": title}
@@ -177,16 +177,16 @@ def plot_trajectory(
 
     Args:
         base: (N, 3) base map points, metres.
-        positions: (K, 3) map positions of the robot, one per frame; NaN where it was not localized: such a
-            frame is not drawn, but counted in the legend.
+        positions: (K, 3) map positions of the robot, one per frame; NaN if it was not localized: such a frame is not
+            drawn, but counted in the legend.
         states: K states, SEARCHING, AMBIGUOUS, TRACKING or LOST.
         path: picture to write.
         truth: (T, 3) true positions, if known.
-        places: (P, 6) that may be right, as :class:`~coview_stream.localization.search.acceptance.Considered` has them.
-        reason: why there is no pose; stands under the title.
+        places: (P, 6) probable places of :class:`~coview_stream.localization.search.acceptance.Considered`.
+        reason: why there is no pose; printed under the title.
 
     Raises:
-        InputError: as many states as positions are needed; or the picture cannot be written.
+        InputError: the numbers of states and positions differ, or the picture cannot be written.
     """
     if len(positions) != len(states):
         raise InputError(f"{path}: {len(states)} states for {len(positions)} positions; give as many of both")
@@ -225,7 +225,7 @@ def _draw_states(axes: Any, positions: Reals, drawn: Bools, states: npt.NDArray[
 
 
 def _draw_line(axes: Any, positions: Reals, drawn: Bools) -> None:
-    """Join positions (K, 2), NaN where there is none: with a dotted line there, behind a cross where poses end."""
+    """Join positions (K, 2); gaps (NaN) get a dotted line, and a cross where the poses end."""
     lost, ends = STATE_COLOURS["LOST"], positions[:-1][drawn[:-1] & ~drawn[1:]]
     axes.plot(*positions[drawn].T, color=lost, linestyle=":", zorder=1)
     axes.plot(*positions.T, color=STATE_COLOURS["TRACKING"], zorder=2)
@@ -235,7 +235,7 @@ def _draw_line(axes: Any, positions: Reals, drawn: Bools) -> None:
 
 
 def _draw_places(axes: Any, places: Floats, shift: Floats) -> None:
-    """Draw probable places (P, 6) on the map: discs, the larger the more probable, with a line ahead."""
+    """Draw probable places (P, 6) on the map as discs, larger if more probable, with a line along the heading."""
     low, high = axes.dataLim.get_points()
     at = places[:, :2] - shift[:2]
     shown = (at >= low).all(axis=1) & (at <= high).all(axis=1) & (places[:, 4] >= _UNLIKELY)
@@ -282,7 +282,7 @@ def plot_errors(distance: Reals, e_t: Reals, e_r: Reals, path: str | os.PathLike
 
 
 def _draw_false(axes: Any, distance: Reals, values: Reals, limit: float) -> None:
-    """Mark false poses and the limit they crossed; metres next to millimetres need a log axis."""
+    """Mark false poses and the limit they exceed, on a log axis, as metres stand next to millimetres."""
     if not len(values):
         axes.set_ylim(bottom=0.0)
         return
@@ -302,9 +302,9 @@ def plot_descriptor_pair(
 ) -> None:
     """Draw two polar descriptors (R, S) side by side on one colour scale.
 
-    Rings run outwards, sectors counter-clockwise from the right. The winner is turned by ``shift`` sectors so
-    that equal places look equal: column ``j`` of the query meets column ``j - shift`` of the winner, which is
-    ``np.roll(winner, shift, axis=1)``. NaN is empty.
+    Rings run outwards, sectors counter-clockwise from the right. The winner is turned by ``shift`` sectors so that
+    equal places look equal: ``np.roll(winner, shift, axis=1)`` puts its column ``j - shift`` on column ``j`` of the
+    query. NaN is empty.
 
     Raises:
         InputError: the descriptors differ in shape, or the picture cannot be written.
@@ -334,7 +334,7 @@ def plot_descriptor_pair(
 def draw_run(result: RunResult, base_map: BaseMap, folder: Path, truth: Reals | None = None) -> None:
     """Draw ``trajectory.png`` and, after a fix, ``descriptors.png`` into an existing folder.
 
-    ``truth`` are true positions (T, 3) in the map, metres.
+    ``truth`` has true positions (T, 3) in the map frame, metres.
 
     Raises:
         InputError: a picture cannot be written.
@@ -343,7 +343,7 @@ def draw_run(result: RunResult, base_map: BaseMap, folder: Path, truth: Reals | 
     smoothed = {pose.stamp: pose for pose in result.smoothed or ()}
     poses = [fix if result.smoothed is None else smoothed.get(fix.stamp) for fix in result.fixes]
     positions = np.array([no_position if p is None or p.T_map_body is None else p.T_map_body[:3, 3] for p in poses])
-    release_arrays(base_map.arrays)  # memory of the search, before pictures take as much
+    release_arrays(base_map.arrays)  # free the search's memory before pictures take as much
     points = base_map.sampled_points(MAX_BASE_POINTS) + base_map.origin
     release_arrays(base_map.arrays)
     states = [

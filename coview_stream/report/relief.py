@@ -1,4 +1,4 @@
-"""Picture of a map from above, for people who know the place: relief, roofs and trees; also as a GeoTIFF."""
+"""Picture of a map from above, with relief, roofs and trees, for people who know the place; also as a GeoTIFF."""
 
 from __future__ import annotations
 
@@ -18,14 +18,14 @@ from coview_stream.geometry.arrays import Bools, Floats, Floats32
 from coview_stream.geometry.rasters import cells, filled, max_filter
 from coview_stream.report.plots import base_shift, draw_notice, figure, map_figure_size
 
-_PIXELS = 1200  # along the longer side: as many as the picture has
+_PIXELS = 1200  # along the picture's longer side
 _MAX_POINTS, _SAMPLED = 4_000_000, 100_000
 _TALL = 2.0  # metres above the ground: roofs and crowns, not cars and hedges
-_PLANE = 0.75  # planarity of the points around a roof; of dense crowns it is less
-_SMOOTH = 0.6  # slope at which a square stands out of its four neighbours: steeper than roofs, as crowns do
+_PLANE = 0.75  # least planarity of the points on a roof; dense crowns have less
+_SMOOTH = 0.6  # slope of a square against the mean of the tall squares around; roofs have less, crowns more
 _COLOURS = {"ground": (236, 230, 214), "roofs and walls": (214, 122, 92), "trees": (112, 164, 108)}
 _SUN = np.array([-1.0, 1.0, 1.4]) / np.linalg.norm([-1.0, 1.0, 1.4])  # from the north-west, as on printed maps
-_DOT, _DENSE = 0.6, 4.0  # points: a station's size, and the least distance at which stations are drawn
+_DOT, _DENSE = 0.6, 4.0  # points: size of a station, and least spacing at which stations are drawn
 _ROUND = (1, 2, 5, 10, 20, 50, 100, 200, 500, 1000, 2000, 5000)  # metres of a scale bar
 
 
@@ -34,8 +34,8 @@ class Relief:
     """Colours of a map's squares.
 
     Attributes:
-        rgba: (H, W, 4) colours, the south first; empty squares are transparent.
-        corner: (2,) of the south-west in the frame of the map's sources, metres.
+        rgba: (H, W, 4) colours, southern row first; empty squares are transparent.
+        corner: (2,) south-west corner in the frame of the map's sources, metres.
         cell: edge of a square, metres.
     """
 
@@ -45,18 +45,18 @@ class Relief:
 
 
 def relief(base_map: BaseMap) -> Relief:
-    """Shade a map's highest points by the sun, and colour roofs, which are smooth and planar, apart from crowns."""
+    """Shade a map's highest points by the sun, and colour smooth planar roofs differently from crowns."""
     every = max(1, -(-len(base_map.points) // _MAX_POINTS))
     points = np.array(base_map.points[::every])
     planarity = np.linalg.norm(base_map.arrays["normals"][::every].astype(np.float32), axis=1) / np.float32(127.0)
     side = np.maximum(np.ptp(points[:, :2], axis=0).astype(np.float64), 1.0)
-    # not finer than the picture's pixels, nor than points lie
+    # no finer than the picture's pixels or the spacing of the points
     cell = max(float(side.max()) / _PIXELS, 1.2 * float(np.sqrt(side.prod() / len(points))), base_map.config.voxel)
     corner, shape, index = cells(points, cell)
     highest = np.full(shape[0] * shape[1], -np.inf, dtype=np.float32)
     np.maximum.at(highest, index, points[:, 2])
     top = highest.reshape(shape)
-    top = np.where(np.isfinite(top), top, max_filter(top, 3))  # squares that points just miss
+    top = np.where(np.isfinite(top), top, max_filter(top, 3))  # fill single holes
     known: Bools = np.isfinite(top)
     ground = _ground(base_map, corner, shape, cell)
     top = np.where(known, top, ground)
@@ -65,10 +65,10 @@ def relief(base_map: BaseMap) -> Relief:
     plane = _around(np.bincount(index[stands], planarity[stands], minlength=top.size).reshape(shape))
     count = _around(np.bincount(index[stands], minlength=top.size).reshape(shape).astype(np.float64))
     beside = _around(tall)
-    bump = np.abs(top - _around(np.where(tall, top, 0.0)) / np.maximum(beside, 1.0))  # out of what stands around it
+    bump = np.abs(top - _around(np.where(tall, top, 0.0)) / np.maximum(beside, 1.0))  # from the mean of tall squares
     smooth = _around(tall & (bump < _SMOOTH * cell)) >= 0.5 * beside
     core = tall & smooth & (plane >= _PLANE * np.maximum(count, 1.0))
-    roof = tall & (_around(_around(core)) >= 0.4 * _around(beside))  # with its edges and chimneys
+    roof = tall & (_around(_around(core)) >= 0.4 * _around(beside))  # includes edges and chimneys
     colour = np.empty((*shape, 3))
     for name, where in {"ground": known, "trees": tall & ~roof, "roofs and walls": roof}.items():
         colour[where] = _COLOURS[name]
@@ -80,7 +80,7 @@ def relief(base_map: BaseMap) -> Relief:
 
 
 def _ground(base_map: BaseMap, corner: Floats, shape: tuple[int, int], cell: float) -> Floats32:
-    """Return the ground's heights (H, W): of the lowest station of each square, and between stations."""
+    """Return the ground heights (H, W) from the lowest station of each square, interpolated between stations."""
     block = max(cell, base_map.config.block)
     wide = int(shape[0] * cell / block) + 1, int(shape[1] * cell / block) + 1
     at = np.floor((base_map.stations[:, :2] - corner) / block).astype(np.int64)
@@ -95,21 +95,21 @@ def _ground(base_map: BaseMap, corner: Floats, shape: tuple[int, int], cell: flo
 
 
 def _around(values: npt.NDArray[Any]) -> Floats:
-    """Return the sums of (H, W) over squares of 3 x 3."""
+    """Return the sums of (H, W) over 3 x 3 windows."""
     padded = np.pad(values.astype(np.float64), 1, mode="edge")
     rows = padded[:-2] + padded[1:-1] + padded[2:]
     return np.asarray(rows[:, :-2] + rows[:, 1:-1] + rows[:, 2:])
 
 
 def _shade(heights: Floats, cell: float) -> Floats:
-    """Return how much light (H, W) heights get, 0 to 1."""
+    """Return the brightness (H, W) of sunlit heights, 0 to 1."""
     north, east = np.gradient(heights, cell) if min(heights.shape) > 1 else (0.0 * heights,) * 2
     light = (_SUN[2] - _SUN[0] * east - _SUN[1] * north) / np.sqrt(1.0 + east**2 + north**2)
     return np.asarray(np.clip(light, 0.0, 1.0))
 
 
 def plot_map(base_map: BaseMap, path: str | os.PathLike[str], title: str = "Base map") -> None:
-    """Draw a map from above with scale, north and, where they do not cover it, its stations; ``.tif``: a GeoTIFF.
+    """Draw a map from above with scale, north and, if sparse enough, its stations; ``.tif`` writes a GeoTIFF.
 
     Raises:
         InputError: the picture cannot be written.
@@ -127,7 +127,7 @@ def plot_map(base_map: BaseMap, path: str | os.PathLike[str], title: str = "Base
         axes.set_aspect("equal")
         for name, axis, metres in (("east", axes.xaxis, shift[0]), ("north", axes.yaxis, shift[1])):
             axis.set_label_text(f"{name} - {metres:,.0f} [m]".replace(",", " ") if metres else f"{name} [m]")
-        drawing.canvas.draw()  # the size of the axes is known then
+        drawing.canvas.draw()  # sets the size of the axes
         _draw_stations(axes, base_map.stations[:, :2] + base_map.origin[:2] - shift)
         axes.set_xlim(left, right)
         axes.set_ylim(bottom, top)
@@ -165,12 +165,12 @@ def _draw_scale(axes: Any, wide: float) -> None:
 
 
 def write_geotiff(seen: Relief, path: str | os.PathLike[str], crs: str | None) -> None:
-    """Write a relief as a GeoTIFF of 8-bit RGBA, deflated, for maps of GIS programs.
+    """Write a relief as a deflated GeoTIFF of 8-bit RGBA, for GIS programs.
 
-    Without a reference system that has an EPSG number it says where it lies, but not in which system.
+    Unless the reference system has an EPSG number, the file states its position but not its system.
 
     Raises:
-        InputError: it cannot be written.
+        InputError: the file cannot be written.
     """
     from PIL import Image, TiffImagePlugin, TiffTags
 
@@ -184,7 +184,7 @@ def write_geotiff(seen: Relief, path: str | os.PathLike[str], crs: str | None) -
     tags[33922] = (0.0, 0.0, 0.0, float(seen.corner[0]), north, 0.0)
     tags[34735] = (1, 1, 0, len(keys), *(number for key in keys for number in key))
     tags.tagtype |= {33550: TiffTags.DOUBLE, 33922: TiffTags.DOUBLE, 34735: TiffTags.SHORT}
-    picture = Image.fromarray(np.ascontiguousarray(seen.rgba[::-1]))  # the north first
+    picture = Image.fromarray(np.ascontiguousarray(seen.rgba[::-1]))  # northern row first
     try:
         with atomic_file(Path(path)) as file:
             picture.save(file, "TIFF", compression="tiff_adobe_deflate", tiffinfo=tags)
