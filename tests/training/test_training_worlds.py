@@ -55,14 +55,6 @@ def stand(mortality: float) -> Stand:
 
 
 @pytest.mark.slow
-def test_views_are_reproducible_from_the_seed() -> None:
-    again, other = world_views(3, SMALL), world_views(4, replace(SMALL, submaps=1))
-    for name in ("aerial", "queries", "poses", "travelled", "sensor"):
-        np.testing.assert_array_equal(getattr(again, name), getattr(small_views(), name))
-    assert not np.array_equal(other.aerial, again.aerial)
-
-
-@pytest.mark.slow
 def test_every_sensor_sees_the_forest() -> None:
     views = small_views()
     assert sorted(views.sensor) == sorted(SMALL.sensors)
