@@ -26,7 +26,6 @@ from coview_stream.localization.registration.register import (
     register,
     registration_covariance,
     remove_prior,
-    swap_rotation_translation,
 )
 
 CONFIG = RegistrationConfig()
@@ -161,12 +160,6 @@ def test_local_map_without_points_is_none_and_is_cut_once(world_map, monkeypatch
     monkeypatch.setattr(clouds, "cut_points", lambda *given: cuts.append(given) or cut_points(*given))
     assert [maps.around(np.array([x, 0.0, 0.0])) for x in (900.0, 901.0, 960.0, 900.0)] == [None] * 4
     assert len(cuts) == 2
-
-
-def test_swap_rotation_translation_reorders_the_same_covariance():
-    C = np.arange(36.0).reshape(6, 6)
-    np.testing.assert_array_equal(swap_rotation_translation(swap_rotation_translation(C)), C)
-    assert swap_rotation_translation(C)[0, 3] == C[3, 0]
 
 
 @pytest.mark.slow
