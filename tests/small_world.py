@@ -53,7 +53,7 @@ def boxes(seed: int, count: int = 18) -> list[Box]:
     return found
 
 
-def _in_box_frame(box: Box, points: np.ndarray) -> np.ndarray:
+def in_box_frame(box: Box, points: np.ndarray) -> np.ndarray:
     return (points - box.centre) @ rot_z(box.yaw)[:2, :2]
 
 
@@ -65,7 +65,7 @@ def sample_map(scene: list[Box], seed: int = 5, spacing: float = 0.25) -> np.nda
     parts = []
     free = np.ones(len(ground), dtype=bool)
     for box in scene:
-        free &= (np.abs(_in_box_frame(box, ground)) > 0.5 * box.size[:2]).any(axis=1)
+        free &= (np.abs(in_box_frame(box, ground)) > 0.5 * box.size[:2]).any(axis=1)
         length, width, height = box.size
         for a, b, normal_axis, side in ((width, height, 0, length), (length, height, 1, width)):
             for sign in (-1.0, 1.0):

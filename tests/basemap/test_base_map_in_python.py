@@ -67,7 +67,6 @@ def test_array_that_is_no_cloud_is_refused(given, says):
 
 
 def test_system_that_is_not_of_metres_is_refused(cut):
-    pytest.importorskip("pyproj", reason="pip install 'coview-stream[build]'")
     with pytest.raises(ConfigError, match="is no reference system; give EPSG:code, WKT, feet or us-feet"):
         BaseMap.build(cut, crs="nonsense")
     with pytest.raises(ConfigError, match="crs 'EPSG:4326' is in degrees"):
@@ -100,8 +99,9 @@ def test_map_says_what_it_is_in_one_line(from_array, world_file):
 
 
 def test_picture_shows_the_points_where_they_are(from_array, cut):
-    figure = pytest.importorskip("matplotlib.figure", reason="pip install 'coview-stream[plot]'")
-    axes = figure.Figure().add_subplot()
+    from matplotlib.figure import Figure
+
+    axes = Figure().add_subplot()
     assert from_array.plot(axes) is axes
     (picture,) = axes.get_images()
     left, right, bottom, top = picture.get_extent()

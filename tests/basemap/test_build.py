@@ -53,8 +53,7 @@ def test_map_points_lie_within_half_a_voxel_of_the_cloud(whole, cut):
 def test_map_records_its_ground_filter(whole, cut, tmp_path, monkeypatch):
     assert whole.parameters["ground_filter"] == ("cloth" if cloth_available() else "morphological")
     monkeypatch.setitem(sys.modules, "CSF", None)
-    np.save(tmp_path / "site.npy", cut + UTM)
-    built = BaseMap.build(tmp_path / "site.npy", **SMALL)
+    built = BaseMap.build(cut + UTM, **SMALL)
     built.save(tmp_path / "site.coview")
     assert BaseMap.load(tmp_path / "site.coview").parameters["ground_filter"] == "morphological"
 
@@ -123,10 +122,9 @@ def test_missing_source_is_refused(tmp_path):
         BaseMap.build(tmp_path / "none.laz", blok=3)
 
 
-def test_configuration_replaces_preset_and_options(cut, tmp_path):
-    np.save(tmp_path / "site.npy", cut[::3])
+def test_configuration_replaces_preset_and_options(cut):
     config = map_preset("slam", block=4.0, channels=("coview",), **SMALL)
-    built = BaseMap.build(tmp_path / "site.npy", config=config)
+    built = BaseMap.build(cut[::3], config=config)
     assert built.config == config
     assert np.allclose((built.stations[:, :2] / 4.0) % 1.0, 0.5)
 

@@ -11,14 +11,12 @@ from coview_stream.errors import MapError
 
 
 @pytest.fixture(scope="module")
-def small(tmp_path_factory):
+def small():
     """Arrays and parameters of a map of a plane with two boxes."""
     rng = np.random.default_rng(3)
     ground = np.c_[rng.uniform(-9, 9, (9000, 2)), rng.normal(0, 0.01, 9000)]
     wall = np.c_[rng.uniform(-4, 4, 3000), np.full(3000, 5.0), rng.uniform(0, 4, 3000)]
-    path = tmp_path_factory.mktemp("map") / "a.npy"
-    np.save(path, np.concatenate([ground, wall]).astype(np.float32))
-    built = BaseMap.build(path)
+    built = BaseMap.build(np.concatenate([ground, wall]))
     # of a map as earlier versions made them, with descriptors
     return built.arrays | {"descriptor.coview": built.descriptors("coview")}, built.parameters
 

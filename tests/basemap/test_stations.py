@@ -53,8 +53,8 @@ def test_station_centres_are_cell_centres_of_an_aligned_raster(low, block, cell)
     np.testing.assert_allclose(corner + cell * (np.column_stack([columns, rows]) + 0.5), centres, atol=1e-4)
 
 
-def sloping_ground(seed=3, half=11.0, count=9000):
-    xy = np.random.default_rng(seed).uniform(-half, half, (count, 2))
+def sloping_ground():
+    xy = np.random.default_rng(3).uniform(-11.0, 11.0, (9000, 2))
     return np.column_stack([xy, 3.0 + 0.05 * xy[:, 0]]).astype(np.float32)
 
 

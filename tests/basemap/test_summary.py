@@ -13,11 +13,6 @@ from coview_stream.errors import CoViewWarning, MapError, MessageError
 from tests.basemap.test_build import SMALL
 
 
-def built(folder, points, **options):
-    np.save(folder / "site.npy", points)
-    return BaseMap.build(folder / "site.npy", **{**SMALL, **options})
-
-
 @pytest.fixture(scope="module")
 def town(map_points):
     near = (np.abs(map_points[:, :2]) < 20.0).all(axis=1)
@@ -25,7 +20,7 @@ def town(map_points):
 
 
 def test_summary_has_the_size_that_the_cloud_has(town, tmp_path):
-    base_map = built(tmp_path, np.add(town, (5e5, 5.4e6, 100.0)))
+    base_map = BaseMap.build(np.add(town, (5e5, 5.4e6, 100.0)), **SMALL)
     found = summary(base_map)
     assert found.width == pytest.approx(np.ptp(town[:, 0]), abs=0.5)
     assert found.depth == pytest.approx(np.ptp(town[:, 1]), abs=0.5)
@@ -53,8 +48,8 @@ def test_summary_has_the_size_that_the_cloud_has(town, tmp_path):
     ],
     ids=["thin", "flat", "y up", "x up"],
 )
-def test_survey_with_a_fault_has_a_warning(town, tmp_path, spoil, says):
-    found = summary(built(tmp_path, spoil(town)))
+def test_survey_with_a_fault_has_a_warning(town, spoil, says):
+    found = summary(BaseMap.build(spoil(town), **SMALL))
     assert any(re.search(says, warning) for warning in found.warnings), found
 
 
@@ -68,8 +63,9 @@ def test_tiles_far_apart_are_told_when_a_map_is_built(town, tmp_path):
 
 def test_too_few_points_are_told_with_file_and_extent(tmp_path):
     degrees = np.random.default_rng(2).uniform((8.0, 50.0, 100), (8.001, 50.001, 110), (60_000, 3))
+    np.save(tmp_path / "site.npy", degrees)
     with pytest.raises(MapError, match=r"site\.npy: .* over 0\.00.* x .* metres\?"):
-        built(tmp_path, degrees)
+        BaseMap.build(tmp_path / "site.npy")
 
 
 def test_thinned_points_are_the_maps_and_on_the_ground_where_it_is_level(world_map):

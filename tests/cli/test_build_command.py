@@ -11,6 +11,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 from laspy.vlrs.known import WktCoordinateSystemVlr
+from pyproj import CRS
 
 from coview_stream.basemap.basemap import BaseMap
 from coview_stream.cli import main
@@ -150,7 +151,7 @@ def test_map_has_no_name_of_another_format(cloud, world_file, tmp_path, refused,
 @pytest.mark.slow
 @pytest.mark.parametrize("output", ["site.coview", "site/"])
 def test_reference_system_that_a_file_does_not_have_is_warned_of(map_points, tmp_path, capsys, output):
-    system = WktCoordinateSystemVlr(pytest.importorskip("pyproj").CRS("EPSG:32632").to_wkt())
+    system = WktCoordinateSystemVlr(CRS("EPSG:32632").to_wkt())
     near = map_points[(np.abs(map_points[:, :2]) < 9.0).all(axis=1)] + (448_000.0, 5_400_000.0, 90.0)
     written(tmp_path / "site.las", near, "1.4", 6, [system])
     words = ["build", str(tmp_path / "site.las"), "-o", f"{tmp_path}/{output}", "--no-learned", "--crs"]

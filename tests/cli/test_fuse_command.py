@@ -31,7 +31,6 @@ def site(map_points, world_run, world_drive, tmp_path_factory):
 
 @pytest.mark.slow
 def test_las_has_sources_stamps_and_reference_system(site, world_run, tmp_path, capsys):
-    pytest.importorskip("pyproj")
     out, more = tmp_path / "fused.laz", ["--changes", "--picture", str(tmp_path / "f.png")]
     assert main(["fuse", str(site / "site.coview"), f"{world_run}:{site / 'out'}", "-o", str(out), *more]) == 0
     assert (tmp_path / "f.png").stat().st_size > 10_000

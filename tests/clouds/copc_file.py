@@ -15,7 +15,7 @@ _SCALE = 0.001
 _FORMAT, _RECORD = 6, 30
 
 
-def write_copc(path, points, classes=None, levels=3):
+def write_copc(path, points, levels=3):
     """Write points (N, 3), metres, as an octree of ``levels`` levels; return the number of its nodes.
 
     Every point stands at one level, drawn by its number. The nodes of the last level are told of in pages of their own.
@@ -23,7 +23,6 @@ def write_copc(path, points, classes=None, levels=3):
     import lazrs
 
     points = np.asarray(points, dtype=np.float64)
-    classes = np.full(len(points), 2, np.uint8) if classes is None else classes
     low, high = points.min(axis=0), points.max(axis=0)
     offset = np.floor(low)
     half = float((high - low).max()) / 2 + 0.01
@@ -50,7 +49,7 @@ def write_copc(path, points, classes=None, levels=3):
         chosen = members[key]
         if key != filled[0]:
             compressor.finish_current_chunk()
-        compressor.compress_many(_records(points[chosen], classes[chosen], offset))
+        compressor.compress_many(_records(points[chosen], offset))
     compressor.done()
     body.seek(start)
     sizes = dict(zip(filled, lazrs.read_chunk_table(body, vlr), strict=True))
@@ -85,11 +84,11 @@ def write_copc(path, points, classes=None, levels=3):
     return len(filled)
 
 
-def _records(points, classes, offset):
+def _records(points, offset):
     records = np.zeros((len(points), _RECORD), np.uint8)
     records[:, :12] = np.round((points - offset) / _SCALE).astype("<i4").view(np.uint8).reshape(-1, 12)
     records[:, 14] = 0x11  # the first return of one
-    records[:, 16] = classes
+    records[:, 16] = 2  # ground
     return np.ascontiguousarray(records).reshape(-1)
 
 

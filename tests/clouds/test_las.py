@@ -39,7 +39,6 @@ def test_points_and_system_by_its_keys_are_read(tmp_path, points, version, point
 
 @pytest.mark.parametrize("suffix", ["las", "laz"])
 def test_system_must_be_in_metres(tmp_path, suffix):
-    pytest.importorskip("pyproj", reason="pyproj is not there; pip install pyproj")
     points = np.random.default_rng(5).uniform((8.0, 50.0, 100), (8.01, 50.01, 130), (500, 3))
     metric = WktCoordinateSystemVlr(PROJECTED.format(unit="metre"))
     assert read_cloud(written(tmp_path / f"b.{suffix}", points, "1.4", 6, [metric])).crs == metric.string

@@ -5,12 +5,11 @@ import re
 import sys
 
 import numpy as np
+import pyproj
 import pytest
 
 from coview_stream.clouds.reference_system import GeoReference, flaw_of_system, same_system, short_name, stated_system
 from coview_stream.errors import InputError
-
-pyproj = pytest.importorskip("pyproj", reason="pyproj is not there; pip install 'coview-stream[geo]'")
 
 
 def flaw(text, place, keys=None):

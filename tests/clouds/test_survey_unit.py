@@ -1,6 +1,7 @@
 """Surveys in feet: their unit, the same system in metres, and maps of them."""
 
 import numpy as np
+import pyproj
 import pytest
 from las_file import written
 from laspy.vlrs.known import WktCoordinateSystemVlr
@@ -13,8 +14,6 @@ from coview_stream.clouds.reference_system import GeoReference
 from coview_stream.clouds.survey_unit import US_FOOT, unit_of_system
 from coview_stream.config import map_preset
 from coview_stream.errors import CloudError, CoViewWarning
-
-pyproj = pytest.importorskip("pyproj", reason="pyproj is not there; pip install '.[geo]'")
 
 
 @pytest.mark.parametrize(

@@ -13,7 +13,7 @@ pytestmark = [pytest.mark.slow, pytest.mark.filterwarnings("ignore:.*which map:U
 
 
 def inside(points, box, grown=0.3):
-    local = np.abs(small_world._in_box_frame(box, points[:, :2]))
+    local = np.abs(small_world.in_box_frame(box, points[:, :2]))
     return (local < 0.5 * box.size[:2] + grown).all(axis=1) & (points[:, 2] > 0.6)
 
 

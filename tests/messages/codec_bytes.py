@@ -54,9 +54,8 @@ def cdr_cloud(
     return out.data(data).put("B", dense).done()
 
 
-def cdr_pose(order="<", covariance=(0.0,) * 36, quaternion=TURN):
-    out = header(order, "map").put("d", 1, 2, 3)
-    return out.put("d", *quaternion).put("d", *covariance)
+def cdr_pose(covariance=(0.0,) * 36):
+    return header(frame="map").put("d", 1, 2, 3, *TURN, *covariance)
 
 
 def cdr_odometry(order="<", quaternion=TURN, position=(1, 2, 3)):

@@ -13,7 +13,6 @@ from coview_stream.errors import ConfigError, InputError
 from coview_stream.geometry.transforms import pose_from, rot_z
 from coview_stream.report.export import FORMATS, chosen_formats, export, reference_for, trajectory_of
 
-pytest.importorskip("pyproj", reason="pyproj is not there; pip install 'coview-stream[geo]'")
 STAMPS = [1_700_000_000.25, 1_700_000_001.5, 1_700_000_002.0]
 POSES = [pose_from(rot_z(0.1 * k), [500_000.0 + k, 5_400_000.0 - 2 * k, 100.0 + k]) for k in range(3)]
 

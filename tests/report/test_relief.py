@@ -70,7 +70,6 @@ def test_geotiff_is_read_by_others_where_it_lies(tmp_path):
 
 
 def test_geotiff_names_its_reference_system(tmp_path):
-    pytest.importorskip("pyproj")
     pillow = pytest.importorskip("PIL.Image")
     write_geotiff(Relief(np.zeros((2, 2, 4), np.uint8), ORIGIN[:2], 0.5), tmp_path / "map.tif", "EPSG:25832")
     with pillow.open(tmp_path / "map.tif") as picture:

@@ -6,6 +6,7 @@ from dataclasses import asdict, replace
 
 import pytest
 
+from coview_stream.basemap.signature import SigningKey, make_keys, read_verify_key
 from coview_stream.basemap.site.manifest import LayerEntry, Manifest, TileEntry
 from coview_stream.basemap.site.store import TileStore
 from coview_stream.config import MapConfig
@@ -76,9 +77,6 @@ def test_manifest_names_a_tile_once():
 
 
 def test_signature_covers_the_hashes_of_the_layers(tmp_path):
-    pytest.importorskip("cryptography", reason="pip install 'coview-stream[sign]'")
-    from coview_stream.basemap.signature import SigningKey, make_keys, read_verify_key
-
     private, public, _ = make_keys(tmp_path / "mine")
     other = read_verify_key(make_keys(tmp_path / "other")[1])
     key = read_verify_key(public)
@@ -95,9 +93,6 @@ def test_signature_covers_the_hashes_of_the_layers(tmp_path):
 
 
 def test_nothing_is_parsed_before_the_signature_is_verified(tmp_path):
-    pytest.importorskip("cryptography", reason="pip install 'coview-stream[sign]'")
-    from coview_stream.basemap.signature import SigningKey, make_keys, read_verify_key
-
     private, public, _ = make_keys(tmp_path / "mine")
     raw = SITE.signed(SigningKey(private)).to_bytes()
     changed = raw.replace(b'"area": 7', b'"area": ]')  # which no parser takes
