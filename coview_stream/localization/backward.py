@@ -31,54 +31,32 @@ from coview_stream.recordings.run import Run
 
 @dataclass(frozen=True, eq=False)
 class BelievedRegistration:
-    """A verified registration of one frame.
+    """A verified registration of one frame."""
 
-    Attributes:
-        T_map_cloud: (4, 4) of the cloud in the sensor's axes, about the map's origin, without the prior.
-        covariance: (6, 6) over (rx, ry, rz, x, y, z), map axes, of this registration alone.
-        shared: (6, 6) likewise, of the error shared with neighbouring registrations, without mount and clock.
-        doubt: factor on the usual protection level.
-        slipped: odometry has slipped since the previous registration, in the order of tracking.
-        backward: whether it comes from backward tracking.
-    """
-
-    T_map_cloud: Pose
-    covariance: Floats
-    shared: Floats
-    doubt: float
-    slipped: bool
-    backward: bool
+    T_map_cloud: Pose  # (4, 4) of the cloud in the sensor's axes, about the map's origin, without the prior
+    covariance: Floats  # (6, 6) over (rx, ry, rz, x, y, z), map axes, of this registration alone
+    shared: Floats  # (6, 6) likewise, of the error shared with neighbouring registrations, without mount and clock
+    doubt: float  # factor on the usual protection level
+    slipped: bool  # odometry has slipped since the previous registration, in the order of tracking
+    backward: bool  # whether it comes from backward tracking
 
 
 @dataclass(eq=False)
 class RecordedFrame:
-    """One usable frame of a run, with the results of tracking.
+    """One usable frame of a run, with the results of tracking."""
 
-    Attributes:
-        index: of the frame in the run.
-        T_odom_body: (4, 4) raw odometry.
-        origin: (3,) of its cloud, zero unless a single scan is stored far from its zero.
-        fix: the live fix.
-        registered: registration of the frame, live or backward; None without one.
-        backward: fix of the backward pass; None without a pose.
-    """
-
-    index: int
-    T_odom_body: Pose
-    origin: Floats
-    fix: Fix
-    registered: BelievedRegistration | None
-    backward: Fix | None = None
+    index: int  # of the frame in the run
+    T_odom_body: Pose  # (4, 4) raw odometry
+    origin: Floats  # (3,) of its cloud, zero unless a single scan is stored far from its zero
+    fix: Fix  # the live fix
+    registered: BelievedRegistration | None  # registration of the frame, live or backward; None without one
+    backward: Fix | None = None  # fix of the backward pass; None without a pose
 
 
 class RecordingLocalizer(Localizer):
-    """Localizer that keeps the registration of the newest frame and can start at a known place.
+    """Localizer that keeps the registration of the newest frame and can start at a known place."""
 
-    Attributes:
-        registered: believed registration of the newest frame; None without one.
-    """
-
-    registered: BelievedRegistration | None = None
+    registered: BelievedRegistration | None = None  # believed registration of the newest frame; None without one
     _slipped = _backward = False
 
     def step(self, cloud: Points, T_odom_body: Pose, stamp: float) -> Fix:

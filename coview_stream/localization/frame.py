@@ -23,21 +23,13 @@ _PLACE_TILT = math.radians(0.5)  # sigma of roll and pitch of a frame registered
 
 @dataclass(frozen=True)
 class PreparedFrame:
-    """One frame, checked and corrected.
+    """One frame, checked and corrected."""
 
-    Attributes:
-        cloud: (N, 3) float32, the sensor's own axes.
-        T_odom_body: (4, 4) corrected odometry at the moment of the cloud, about the anchor.
-        T_odom_raw: (4, 4) raw odometry at the stamp.
-        stamp: seconds.
-        scan: one point per voxel.
-    """
-
-    cloud: Points
-    T_odom_body: Pose
-    T_odom_raw: Pose
-    stamp: float
-    scan: RawScan
+    cloud: Points  # (N, 3) float32, the sensor's own axes
+    T_odom_body: Pose  # (4, 4) corrected odometry at the moment of the cloud, about the anchor
+    T_odom_raw: Pose  # (4, 4) raw odometry at the stamp
+    stamp: float  # seconds
+    scan: RawScan  # one point per voxel
 
 
 class FramePreparation:

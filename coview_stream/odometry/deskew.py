@@ -16,15 +16,10 @@ _INSTANT = 1e-4  # seconds; smaller time differences are ignored
 
 @dataclass(frozen=True)
 class SweepCorrection:
-    """Calibration of sensor and odometry, for deskewing a sweep.
+    """Calibration of sensor and odometry, for deskewing a sweep."""
 
-    Attributes:
-        R_body_cloud: (3, 3) rotation that levels clouds of a leaning sensor.
-        scale: correction factor of odometry's distances, minus one.
-    """
-
-    R_body_cloud: Floats
-    scale: float = 0.0
+    R_body_cloud: Floats  # (3, 3) rotation that levels clouds of a leaning sensor
+    scale: float = 0.0  # correction factor of odometry's distances, minus one
 
 
 def deskew(

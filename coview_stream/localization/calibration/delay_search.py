@@ -23,22 +23,14 @@ _TILT = 2.0  # ratio of a registration's errors of roll and pitch to that of its
 
 
 class SeenMotion(NamedTuple):
-    """Registered motion between two clouds.
+    """Registered motion between two clouds."""
 
-    motion: (4, 4) in the body's axes.
-    begin: stamp of the first cloud, seconds.
-    end: stamp of the second cloud.
-    applied: calibration at that time.
-    noise: (3, 3) covariance of x, y and heading without the calibration's.
-    J: (3, 6) derivatives of x, y and heading by the calibration (eq. C2).
-    """
-
-    motion: Pose
-    begin: float
-    end: float
-    applied: Calibration
-    noise: Floats
-    J: Floats
+    motion: Pose  # (4, 4) in the body's axes
+    begin: float  # stamp of the first cloud, seconds
+    end: float  # stamp of the second cloud
+    applied: Calibration  # calibration at that time
+    noise: Floats  # (3, 3) covariance of x, y and heading without the calibration's
+    J: Floats  # (3, 6) derivatives of x, y and heading by the calibration (eq. C2)
 
     @property
     def spread(self) -> Floats:

@@ -55,28 +55,20 @@ class Most:
 
 @dataclass(frozen=True)
 class Background:
-    """Shares at chance places, and the number of independent observations in a scan.
+    """Shares at chance places, and the number of independent observations in a scan."""
 
-    Attributes:
-        structure: (4,) probabilities that a covered structure point is on map structure, only near it, under an edge,
-            unexplained.
-        around: (4,) the same around chance places; None if not observed.
-        within: (4,) variances among the neighbours of one place, in units of one point's.
-        between: (4,) variances of ``around`` from place to place.
-        passed: probability that a free point lies on map structure.
-        ground: parameters of the Beta distribution, over places, of the share of the ground on the map's ground.
-        number: effective numbers of independent structure points and of free points.
-        open: probability that a chance place is as clear and level as the right one; (Q, L) by nuisance values.
-    """
-
+    # (4,) probabilities that a covered structure point is on map structure, only near it, under an edge, unexplained
     structure: Floats
-    passed: float
+    passed: float  # probability that a free point lies on map structure
+    # parameters of the Beta distribution, over places, of the share of the ground on the map's ground
     ground: tuple[float, float]
-    number: tuple[float, float]
+    number: tuple[float, float]  # effective numbers of independent structure points and of free points
+    # probability that a chance place is as clear and level as the right one; (Q, L) by nuisance values
     open: float | Floats = OPEN
-    around: Floats | None = None
+    around: Floats | None = None  # (4,) the same around chance places; None if not observed
+    # (4,) variances among the neighbours of one place, in units of one point's
     within: Floats = field(default_factory=lambda: np.zeros(4))
-    between: Floats = field(default_factory=lambda: np.zeros(4))
+    between: Floats = field(default_factory=lambda: np.zeros(4))  # (4,) variances of around from place to place
 
     def structure_at(self, observed: Floats32) -> Floats:
         """Return ``structure`` (P, 4) at places observed (P, 15), by the outcomes around each; (1, 4) without those."""

@@ -117,16 +117,11 @@ class Observations:
 
 @dataclass(frozen=True)
 class ScanPart:
-    """A sample of a scan's points to look up.
+    """A sample of a scan's points to look up."""
 
-    Attributes:
-        points: of each kind, relative to the body, axes of the odometry frame, metres.
-        weights: number of the scan's structure, ground and free points per sampled one.
-        level: share of the scan's ground that is compared with the survey's: the rest was dug or filled since.
-    """
-
-    points: kernels.FieldScan
-    weights: tuple[float, float, float]
+    points: kernels.FieldScan  # of each kind, relative to the body, axes of the odometry frame, metres
+    weights: tuple[float, float, float]  # number of the scan's structure, ground and free points per sampled one
+    # share of the scan's ground that is compared with the survey's: the rest was dug or filled since
     level: float = 1.0
 
     @classmethod
@@ -171,24 +166,16 @@ class ScanPart:
 
 @dataclass(frozen=True, eq=False)
 class ObservedScan:
-    """A scan to register, with two samples for the field: few points for many poses, many points for the best poses.
+    """A scan to register, with two samples for the field: few points for many poses, many points for the best poses."""
 
-    Attributes:
-        cloud: the points to register, odometry frame, metres.
-        T_odom_body: (4, 4) odometry of the newest frame.
-        few: a sample.
-        many: a sample of four times as many points.
-        patches: number of four-metre patches with structure, and of cubes with free space: upper limits of the number
-            of independent observations.
-        filled: (F,) identifiers of those patches, comparable between scans of one odometry frame.
-    """
-
-    cloud: RegistrationCloud
-    T_odom_body: Pose
-    few: ScanPart
-    many: ScanPart
+    cloud: RegistrationCloud  # the points to register, odometry frame, metres
+    T_odom_body: Pose  # (4, 4) odometry of the newest frame
+    few: ScanPart  # a sample
+    many: ScanPart  # a sample of four times as many points
+    # number of four-metre patches with structure, and of cubes with free space: upper limits of the number of
+    # independent observations
     patches: tuple[float, float]
-    filled: Ints
+    filled: Ints  # (F,) identifiers of those patches, comparable between scans of one odometry frame
 
     @classmethod
     def of(cls, cloud: RegistrationCloud, frame: Points, T_odom_body: Pose) -> ObservedScan:

@@ -34,17 +34,11 @@ SIGHT = 35.0
 
 @dataclass(frozen=True)
 class _Drives:
-    """Drives from stations at random headings, with odometry's motion.
+    """Drives from stations at random headings, with odometry's motion."""
 
-    Attributes:
-        poses: (S, 4) at the newest keyframe.
-        weights: (S,) number of drives that each represents.
-        observed: (S, W, 7) observations at the keyframes, oldest first.
-    """
-
-    poses: Floats
-    weights: Floats
-    observed: Floats32
+    poses: Floats  # (S, 4) at the newest keyframe
+    weights: Floats  # (S,) number of drives that each represents
+    observed: Floats32  # (S, W, 7) observations at the keyframes, oldest first
 
     @classmethod
     def none(cls) -> _Drives:

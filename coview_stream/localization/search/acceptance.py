@@ -55,30 +55,19 @@ class Considered:
 
 @dataclass(frozen=True)
 class SearchResult:
-    """Result of one keyframe's search.
+    """Result of one keyframe's search."""
 
-    Attributes:
-        accepted: the registered place; None if none is accepted.
-        evidence: of the most probable place, with the resulting state and the reason.
-        travelled: metres that odometry had driven at the keyframe.
-        epoch: of the request.
-        rivals: all scored places of the keyframe.
-        leader: (4, 4) T_map_odom of the most probable place, registered if that succeeded, levelled by the newest frame
-            alone; None without any place.
-        T_odom_body: (4, 4) of the keyframe.
-        calibration: that levelled the keyframe's clouds.
-        considered: the most probable places, for display; None without any place.
-    """
-
-    accepted: Hypothesis | None
-    evidence: KeyframeEvidence
-    travelled: float = 0.0
-    epoch: Epoch = FIRST_EPOCH
-    rivals: Rivals = field(default_factory=Rivals)
+    accepted: Hypothesis | None  # the registered place; None if none is accepted
+    evidence: KeyframeEvidence  # of the most probable place, with the resulting state and the reason
+    travelled: float = 0.0  # metres that odometry had driven at the keyframe
+    epoch: Epoch = FIRST_EPOCH  # of the request
+    rivals: Rivals = field(default_factory=Rivals)  # all scored places of the keyframe
+    # (4, 4) T_map_odom of the most probable place, registered if that succeeded, levelled by the newest frame alone;
+    # None without any place
     leader: Pose | None = None
-    T_odom_body: Pose = field(default_factory=lambda: np.eye(4))
-    calibration: Calibration = field(default_factory=Calibration)
-    considered: Considered | None = None
+    T_odom_body: Pose = field(default_factory=lambda: np.eye(4))  # (4, 4) of the keyframe
+    calibration: Calibration = field(default_factory=Calibration)  # that levelled the keyframe's clouds
+    considered: Considered | None = None  # the most probable places, for display; None without any place
 
     @property
     def T_map_cloud(self) -> Pose | None:

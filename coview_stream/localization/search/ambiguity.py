@@ -58,31 +58,18 @@ _TABLE = 64  # patches until the random draws repeat
 
 @dataclass(frozen=True, eq=False)
 class Ambiguity:
-    """Driving distances from K stations until a robot is localized.
+    """Driving distances from K stations until a robot is localized."""
 
-    Attributes:
-        station: (K,) indices of the stations.
-        position: (K, 3) their positions, metres, relative to the map's origin.
-        drive: (K,) metres; 0 at once, infinite if not within 40 m or before the path ends.
-        driven: (K,) whether ``drive`` was simulated there; otherwise it is the nearest simulated station's.
-        evidence: (K,) log-likelihood ratio of the place against chance at the first keyframe, nats.
-        lead: (K,) its difference to the best place elsewhere, nats.
-        error: (K,) probability at the first keyframe that the robot is elsewhere.
-        wrong: (K,) whether a search would have accepted another place.
-        risk: accepted probability of an error.
-        changed: presumed share of the site that has changed since the survey.
-    """
-
-    station: Indices
-    position: Floats
-    drive: Floats
-    driven: Bools
-    evidence: Floats
-    lead: Floats
-    error: Floats
-    wrong: Bools
-    risk: float
-    changed: float
+    station: Indices  # (K,) indices of the stations
+    position: Floats  # (K, 3) their positions, metres, relative to the map's origin
+    drive: Floats  # (K,) metres; 0 at once, infinite if not within 40 m or before the path ends
+    driven: Bools  # (K,) whether drive was simulated there; otherwise it is the nearest simulated station's
+    evidence: Floats  # (K,) log-likelihood ratio of the place against chance at the first keyframe, nats
+    lead: Floats  # (K,) its difference to the best place elsewhere, nats
+    error: Floats  # (K,) probability at the first keyframe that the robot is elsewhere
+    wrong: Bools  # (K,) whether a search would have accepted another place
+    risk: float  # accepted probability of an error
+    changed: float  # presumed share of the site that has changed since the survey
 
     def __len__(self) -> int:
         """Return the number of stations K."""

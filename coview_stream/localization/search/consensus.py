@@ -29,33 +29,19 @@ _BIN, _BIN_YAW = 2.0 / 3.0, 0.5  # bin sizes relative to the distances that make
 
 @dataclass(frozen=True)
 class Hypothesis:
-    """A hypothesis of ``T_map_odom``, from the votes that name it to its registration.
+    """A hypothesis of ``T_map_odom``, from the votes that name it to its registration."""
 
-    Attributes:
-        T_map_odom: (4, 4); after registration the registered pose.
-        station: index of the station; None for a pose hint, which has no votes.
-        shift: number of sectors; None for a pose hint.
-        votes: sum of the votes, lower is better.
-        learned: whether learned features voted.
-        hinted: whether a pose hint led to this place.
-        score: of the newest keyframe, in [0, 1], by the field.
-        ratio: log-likelihood ratio of the keyframes so far against chance.
-        probability: posterior probability that the robot is here.
-        registration: of the newest keyframe.
-        evidence: at the registered pose.
-    """
-
-    T_map_odom: Pose
-    station: int | None = None
-    shift: int | None = None
-    votes: float = 0.0
-    learned: bool = False
-    hinted: bool = False
-    score: float = 0.0
-    ratio: float = 0.0
-    probability: float = 0.0
-    registration: Registration | None = None
-    evidence: Evidence | None = None
+    T_map_odom: Pose  # (4, 4); after registration the registered pose
+    station: int | None = None  # index of the station; None for a pose hint, which has no votes
+    shift: int | None = None  # number of sectors; None for a pose hint
+    votes: float = 0.0  # sum of the votes, lower is better
+    learned: bool = False  # whether learned features voted
+    hinted: bool = False  # whether a pose hint led to this place
+    score: float = 0.0  # of the newest keyframe, in [0, 1], by the field
+    ratio: float = 0.0  # log-likelihood ratio of the keyframes so far against chance
+    probability: float = 0.0  # posterior probability that the robot is here
+    registration: Registration | None = None  # of the newest keyframe
+    evidence: Evidence | None = None  # at the registered pose
 
     def after(self, T_other_odom: Pose) -> Hypothesis:
         """Return the hypothesis for the odometry frame, given another frame (4, 4) into which that was turned."""
@@ -92,19 +78,12 @@ class Vote(Protocol):
 
 @dataclass(frozen=True)
 class _Places:
-    """N level hypotheses of ``T_map_odom`` and the votes on them.
+    """N level hypotheses of ``T_map_odom`` and the votes on them."""
 
-    Attributes:
-        shift: (N,) headings.
-        offset: (N, 3) float64 position of the odometry frame's origin; map frame, metres.
-        station: (N,) of the newest keyframe, -1 for none.
-        votes: (N, W) z-scores of the keyframes in the window, 0 before they vote.
-    """
-
-    shift: Ints
-    offset: Floats
-    station: Indices
-    votes: Floats32
+    shift: Ints  # (N,) headings
+    offset: Floats  # (N, 3) float64 position of the odometry frame's origin; map frame, metres
+    station: Indices  # (N,) of the newest keyframe, -1 for none
+    votes: Floats32  # (N, W) z-scores of the keyframes in the window, 0 before they vote
 
     @classmethod
     def none(cls, window: int) -> _Places:

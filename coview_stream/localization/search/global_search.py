@@ -31,23 +31,14 @@ _STREET = 12.0  # metres from the leader: reach of the farthest hypothesis aroun
 
 @dataclass(frozen=True)
 class Reading:
-    """A reading of a keyframe, level or leaning, and its places.
+    """A reading of a keyframe, level or leaning, and its places."""
 
-    Attributes:
-        request: the keyframe, rotated about the body.
-        scan: of the keyframe.
-        scored: the places.
-        leader: the first place, registered; None if that failed.
-        level: (4, 4) the leader's ``T_map_odom``, levelled by the newest frame alone; None without a leader.
-        turn: (4, 4) rotated odometry frame <- odometry frame.
-    """
-
-    request: SearchRequest
-    scan: ObservedScan
-    scored: Scored
-    leader: Hypothesis | None
-    level: Pose | None
-    turn: Pose = field(default_factory=lambda: np.eye(4))
+    request: SearchRequest  # the keyframe, rotated about the body
+    scan: ObservedScan  # of the keyframe
+    scored: Scored  # the places
+    leader: Hypothesis | None  # the first place, registered; None if that failed
+    level: Pose | None  # (4, 4) the leader's T_map_odom, levelled by the newest frame alone; None without a leader
+    turn: Pose = field(default_factory=lambda: np.eye(4))  # (4, 4) rotated odometry frame <- odometry frame
 
     @property
     def leans(self) -> bool:

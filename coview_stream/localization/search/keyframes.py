@@ -35,18 +35,12 @@ def _no_points() -> Points:
 
 @dataclass(frozen=True)
 class Keyframe:
-    """All frames since the previous keyframe.
+    """All frames since the previous keyframe."""
 
-    Attributes:
-        stamp: of the newest frame, seconds.
-        scan: one point per voxel, with the newest frame's odometry.
-        begins_anew: the calibration has changed so much that earlier keyframes have been levelled again.
-        frame: (N, 3) float32 the newest frame itself, in the sensor's axes, for its rays; none by default.
-    """
-
-    stamp: float
-    scan: RawScan
-    begins_anew: bool = False
+    stamp: float  # of the newest frame, seconds
+    scan: RawScan  # one point per voxel, with the newest frame's odometry
+    begins_anew: bool = False  # the calibration has changed so much that earlier keyframes have been levelled again
+    # (N, 3) float32 the newest frame itself, in the sensor's axes, for its rays; none by default
     frame: Points = field(default_factory=_no_points)
 
     @property

@@ -47,17 +47,11 @@ _SAME_METRES, _SAME_RADIANS = 0.3, np.radians(2.0)  # closer poses are one mode
 
 @dataclass(frozen=True)
 class Modes:
-    """The modes of a place.
+    """The modes of a place."""
 
-    Attributes:
-        best: the most probable mode.
-        distances: (M,) metres from the best mode.
-        probabilities: (M,) add up to one.
-    """
-
-    best: Hypothesis
-    distances: Floats
-    probabilities: Floats
+    best: Hypothesis  # the most probable mode
+    distances: Floats  # (M,) metres from the best mode
+    probabilities: Floats  # (M,) add up to one
 
     @property
     def undecided(self) -> float:

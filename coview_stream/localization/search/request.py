@@ -18,15 +18,10 @@ SAME_DISTANCE, SAME_ANGLE = 2.0, float(np.radians(5.0))  # metres, radians: clos
 
 
 class Epoch(NamedTuple):
-    """Period within which scans and poses belong together: one odometry frame, between two losses.
+    """Period within which scans and poses belong together: one odometry frame, between two losses."""
 
-    Attributes:
-        odometry: the caller's number of the odometry frame.
-        restart: number of the localizer's restarts.
-    """
-
-    odometry: int = 0
-    restart: int = 0
+    odometry: int = 0  # the caller's number of the odometry frame
+    restart: int = 0  # number of the localizer's restarts
 
 
 FIRST_EPOCH = Epoch()
@@ -38,15 +33,10 @@ def _no_points() -> Points:
 
 @dataclass(frozen=True)
 class RequestSpec:
-    """Data that a search needs in its requests.
+    """Data that a search needs in its requests."""
 
-    Attributes:
-        descriptor: of the local scan; None if no scan is needed.
-        reach: radius of the surroundings, metres; None if unneeded.
-    """
-
-    descriptor: DescriptorConfig | None
-    reach: float | None = None
+    descriptor: DescriptorConfig | None  # of the local scan; None if no scan is needed
+    reach: float | None = None  # radius of the surroundings, metres; None if unneeded
 
 
 class EarlierKeyframe(NamedTuple):
@@ -59,38 +49,25 @@ class EarlierKeyframe(NamedTuple):
 
 @dataclass(frozen=True)
 class SearchRequest:
-    """One keyframe to search the map for.
+    """One keyframe to search the map for."""
 
-    Attributes:
-        stamp: of the keyframe, seconds.
-        T_odom_body: (4, 4) of the keyframe.
-        scan: (N, 3) float32 virtual local scan, odometry frame, metres; empty without a descriptor.
-        submap: (N, 3) float32 points to register, of the newest keyframes, odometry frame.
-        cloud: (N, 3) float32 newest frame, body frame.
-        travelled: metres that odometry had driven.
-        epoch: a request of another epoch restarts the search.
-        hints: possible ``T_map_odom``, each (4, 4), judged like the votes' hypotheses.
-        guesses: ``T_map_odom`` by a :class:`PlaceGuess`, each (4, 4), with unknown heights, judged likewise.
-        surroundings: (N, 3) float32 points within ``RequestSpec.reach``, odometry frame; empty if unneeded.
-        calibration: that levelled ``cloud``.
-        area: the only part of the map to search, metres from its zero; None for all of it.
-        earlier: keyframes with which the search continues, oldest first, where clouds were levelled again.
-        lean_prior: log-probability of the lean that levels the clouds, where it was fitted at a leading place.
-    """
-
-    stamp: float
-    T_odom_body: Pose
-    scan: Points
-    submap: Points
-    cloud: Points
-    travelled: float = 0.0
-    epoch: Epoch = FIRST_EPOCH
-    hints: tuple[Pose, ...] = ()
+    stamp: float  # of the keyframe, seconds
+    T_odom_body: Pose  # (4, 4) of the keyframe
+    scan: Points  # (N, 3) float32 virtual local scan, odometry frame, metres; empty without a descriptor
+    submap: Points  # (N, 3) float32 points to register, of the newest keyframes, odometry frame
+    cloud: Points  # (N, 3) float32 newest frame, body frame
+    travelled: float = 0.0  # metres that odometry had driven
+    epoch: Epoch = FIRST_EPOCH  # a request of another epoch restarts the search
+    hints: tuple[Pose, ...] = ()  # possible T_map_odom, each (4, 4), judged like the votes' hypotheses
+    # T_map_odom by a PlaceGuess, each (4, 4), with unknown heights, judged likewise
     guesses: tuple[Pose, ...] = ()
+    # (N, 3) float32 points within RequestSpec.reach, odometry frame; empty if unneeded
     surroundings: Points = field(default_factory=_no_points)
-    calibration: Calibration = field(default_factory=Calibration)
-    area: Circle | None = None
+    calibration: Calibration = field(default_factory=Calibration)  # that levelled cloud
+    area: Circle | None = None  # the only part of the map to search, metres from its zero; None for all of it
+    # keyframes with which the search continues, oldest first, where clouds were levelled again
     earlier: tuple[EarlierKeyframe, ...] = ()
+    # log-probability of the lean that levels the clouds, where it was fitted at a leading place
     lean_prior: float = 0.0
 
     @property

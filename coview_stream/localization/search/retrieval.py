@@ -78,19 +78,12 @@ class CoViewVote:
 
 @dataclass(frozen=True)
 class SearchStations:
-    """Stations (K,) that keyframes are compared with.
+    """Stations (K,) that keyframes are compared with."""
 
-    Attributes:
-        index: of the descriptors.
-        grid: look-up by position; its blocks are the squares, if any.
-        numbers: (K,) of the stations in the map; None if they are all of the map's.
-        squares: of stations that share one compared station; None if every station is compared.
-    """
-
-    index: StationIndex
-    grid: StationGrid
-    numbers: Ints | None = None
-    squares: _Squares | None = None
+    index: StationIndex  # of the descriptors
+    grid: StationGrid  # look-up by position; its blocks are the squares, if any
+    numbers: Ints | None = None  # (K,) of the stations in the map; None if they are all of the map's
+    squares: _Squares | None = None  # of stations that share one compared station; None if every station is compared
 
     @classmethod
     def of(cls, index: StationIndex, grid: StationGrid, chosen: Ints | None = None) -> SearchStations:
@@ -126,17 +119,11 @@ class SearchStations:
 
 @dataclass(frozen=True)
 class _Squares:
-    """Squares of stations.
+    """Squares of stations."""
 
-    Attributes:
-        members: (K, n) station numbers by square, -1 for none.
-        codes: of all stations of the map.
-        stations: (M, 3) of the map.
-    """
-
-    members: Int32s
-    codes: StationCodes
-    stations: Floats32
+    members: Int32s  # (K, n) station numbers by square, -1 for none
+    codes: StationCodes  # of all stations of the map
+    stations: Floats32  # (M, 3) of the map
 
     def refined(self, places: Sequence[Hypothesis], vote: CoViewVote, keyframes: int) -> list[Hypothesis]:
         """Return the places with the newest keyframe on the best station of each square, best first."""

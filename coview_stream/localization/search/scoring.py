@@ -55,16 +55,12 @@ AROUND = np.array([(r * np.cos(a), r * np.sin(a)) for r in (3.5, 7.0) for a in n
 
 @dataclass(frozen=True)
 class Rivals:
-    """All distinct places of one keyframe, best score first.
+    """All distinct places of one keyframe, best score first."""
 
-    Attributes:
-        T_map_odom: (N, 4, 4).
-        scores: (N,) float32 evidence scores in [0, 1]; the best from four times as many points.
-        inside: (N,) float32 shares of the scan in the surveyed area.
-    """
-
-    T_map_odom: Floats = field(default_factory=lambda: np.empty((0, 4, 4)))
+    T_map_odom: Floats = field(default_factory=lambda: np.empty((0, 4, 4)))  # (N, 4, 4)
+    # (N,) float32 evidence scores in [0, 1]; the best from four times as many points
     scores: Floats32 = field(default_factory=lambda: np.empty(0, dtype=np.float32))
+    # (N,) float32 shares of the scan in the surveyed area
     inside: Floats32 = field(default_factory=lambda: np.empty(0, dtype=np.float32))
 
     def __len__(self) -> int:
@@ -74,25 +70,15 @@ class Rivals:
 
 @dataclass(frozen=True)
 class Scored:
-    """Scores of a keyframe's hypotheses.
+    """Scores of a keyframe's hypotheses."""
 
-    Attributes:
-        rivals: all places.
-        places: followed places, most probable first.
-        error: probability that the robot is not at the first place.
-        none: probability that it is at no place of the map.
-        by_chance: expected number of chance places as good as the first.
-        second: most probable place other than the first; None without any.
-        moved: part of the scans that fits elsewhere than at the first.
-    """
-
-    rivals: Rivals
-    places: list[Hypothesis]
-    error: float = 1.0
-    none: float = 1.0
-    by_chance: float = np.inf
-    second: Hypothesis | None = None
-    moved: MovedPart = NO_PART
+    rivals: Rivals  # all places
+    places: list[Hypothesis]  # followed places, most probable first
+    error: float = 1.0  # probability that the robot is not at the first place
+    none: float = 1.0  # probability that it is at no place of the map
+    by_chance: float = np.inf  # expected number of chance places as good as the first
+    second: Hypothesis | None = None  # most probable place other than the first; None without any
+    moved: MovedPart = NO_PART  # part of the scans that fits elsewhere than at the first
 
     @property
     def left(self) -> int:
@@ -123,19 +109,12 @@ class Scored:
 
 @dataclass(frozen=True)
 class Followed:
-    """P followed places and their observations.
+    """P followed places and their observations."""
 
-    Attributes:
-        hypotheses: at the newest keyframe.
-        votes: (P,) rank of each in the newest votes that named it, from 0.
-        observed: (P, W, 15) observations at and around the places at the keyframes, oldest first.
-        newest: (P,) rows among the newest keyframe's poses.
-    """
-
-    hypotheses: list[Hypothesis]
-    votes: Ints
-    observed: Floats32
-    newest: Ints
+    hypotheses: list[Hypothesis]  # at the newest keyframe
+    votes: Ints  # (P,) rank of each in the newest votes that named it, from 0
+    observed: Floats32  # (P, W, 15) observations at and around the places at the keyframes, oldest first
+    newest: Ints  # (P,) rows among the newest keyframe's poses
 
     @classmethod
     def none(cls) -> Followed:
@@ -150,19 +129,12 @@ class Followed:
 
 @dataclass(frozen=True)
 class _Observed:
-    """Observations of a keyframe at H hypotheses, followed ones first, moved to the best poses near them.
+    """Observations of a keyframe at H hypotheses, followed ones first, moved to the best poses near them."""
 
-    Attributes:
-        poses: (H, 4).
-        shares: (H, 15) observations, also around the places' best hypotheses.
-        scores: (H,) evidence scores.
-        groups: rows by place, best hypothesis and best place first.
-    """
-
-    poses: Floats
-    shares: Floats32
-    scores: Floats32
-    groups: list[list[int]]
+    poses: Floats  # (H, 4)
+    shares: Floats32  # (H, 15) observations, also around the places' best hypotheses
+    scores: Floats32  # (H,) evidence scores
+    groups: list[list[int]]  # rows by place, best hypothesis and best place first
 
     @property
     def first(self) -> Ints:

@@ -88,19 +88,13 @@ class Pair(NamedTuple):
 
 @dataclass(frozen=True)
 class Reading:
-    """A way in which clouds and odometry may have been sent, with a finding and a remedy for people.
-
-    Attributes:
-        heading: of the body's x in the level axes of the clouds, radians.
-        mirrored: whether the clouds' y points right.
-        change: correction of odometry.
-    """
+    """A way in which clouds and odometry may have been sent, with a finding and a remedy for people."""
 
     found: str
     remedy: str
-    heading: float = 0.0
-    mirrored: bool = False
-    change: Change | None = None
+    heading: float = 0.0  # of the body's x in the level axes of the clouds, radians
+    mirrored: bool = False  # whether the clouds' y points right
+    change: Change | None = None  # correction of odometry
 
 
 @dataclass(frozen=True)

@@ -41,17 +41,11 @@ _TILE_RADIUS = 0.75 * TILE * LOCAL_CELL  # metres from a tile's middle to beyond
 
 @dataclass(frozen=True)
 class QueryFeatures:
-    """The ground network's output around a robot.
+    """The ground network's output around a robot."""
 
-    Attributes:
-        features: of an image with ``centre`` in its middle, along the axes of the odometry frame.
-        weight: (h, w) of the local descriptors' cells; zero beyond the reach.
-        centre: (3,) the ground below the robot, odometry frame, metres.
-    """
-
-    features: Features
-    weight: Floats32
-    centre: Floats
+    features: Features  # of an image with centre in its middle, along the axes of the odometry frame
+    weight: Floats32  # (h, w) of the local descriptors' cells; zero beyond the reach
+    centre: Floats  # (3,) the ground below the robot, odometry frame, metres
 
     @property
     def place(self) -> Floats32:

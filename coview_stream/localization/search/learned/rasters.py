@@ -31,17 +31,11 @@ _BYTE = 127.0
 
 @dataclass(frozen=True)
 class StationCells:
-    """Blocks of cells around M stations on a raster.
+    """Blocks of cells around M stations on a raster."""
 
-    Attributes:
-        first: (M, 2) row and column of a block's first cell, which may lie off the raster.
-        size: (M, 2) rows and columns of the block.
-        shape: (2,) rows and columns of the raster.
-    """
-
-    first: Ints
-    size: Ints
-    shape: tuple[int, int]
+    first: Ints  # (M, 2) row and column of a block's first cell, which may lie off the raster
+    size: Ints  # (M, 2) rows and columns of the block
+    shape: tuple[int, int]  # (2,) rows and columns of the raster
 
     def __len__(self) -> int:
         return len(self.first)
@@ -143,23 +137,14 @@ class FeatureVote:
 
 @dataclass(frozen=True)
 class FeatureRasters:
-    """Fine and coarse rasters of a map's features.
+    """Fine and coarse rasters of a map's features."""
 
-    Attributes:
-        axes: (D, C) orthonormal principal directions.
-        corner: (2,) x and y of the lower corner of cell (0, 0), metres.
-        cell: edge of a fine cell, metres.
-        shape: fine rows and columns.
-        fine: features times 127; the last dimension is 127 in cells with features.
-        coarse: mean features over cells twice as large, with their spectra.
-    """
-
-    axes: Floats32
-    corner: Floats
-    cell: float
-    shape: tuple[int, int]
-    fine: WindowRaster
-    coarse: FeatureIndex
+    axes: Floats32  # (D, C) orthonormal principal directions
+    corner: Floats  # (2,) x and y of the lower corner of cell (0, 0), metres
+    cell: float  # edge of a fine cell, metres
+    shape: tuple[int, int]  # fine rows and columns
+    fine: WindowRaster  # features times 127; the last dimension is 127 in cells with features
+    coarse: FeatureIndex  # mean features over cells twice as large, with their spectra
 
     @classmethod
     def of(cls, features: FeatureMap, cell: float, half: int) -> FeatureRasters:
@@ -180,17 +165,11 @@ class FeatureRasters:
 
 @dataclass(frozen=True)
 class TurnedQuery:
-    """A query at S headings.
+    """A query at S headings."""
 
-    Attributes:
-        images: (S, h + 1, h + 1, 8) int8 weighted features, and the weight in the last dimension.
-        coarse: (g, g, K, D + 1) float32 in coarse cells at some headings of the first half turn.
-        headings: (K,) numbers of the coarse headings.
-    """
-
-    images: WindowImages
-    coarse: Floats32
-    headings: Ints
+    images: WindowImages  # (S, h + 1, h + 1, 8) int8 weighted features, and the weight in the last dimension
+    coarse: Floats32  # (g, g, K, D + 1) float32 in coarse cells at some headings of the first half turn
+    headings: Ints  # (K,) numbers of the coarse headings
 
 
 def turn_query(local: Floats32, weight: Floats32, rasters: FeatureRasters, ratio: int, yaws: Floats) -> TurnedQuery:
