@@ -43,12 +43,9 @@ def channel(name: Channel, grid: PolarGrid) -> Descriptor:
 
 
 def describe(points: Points, centre: Floats, config: DescriptorConfig) -> dict[Channel, Descriptor]:
-    """Describe a virtual local scan by channels, (R, S) each.
+    """Describe a virtual local scan, gravity-aligned points (N, 3), one per voxel, by channels, (R, S) each.
 
-    Args:
-        points: (N, 3) gravity-aligned points, metres, one per voxel.
-        centre: (3,) zero of the descriptor: the keyframe's x and y, and the height of the ground below it.
-        config: bins and channels.
+    ``centre`` (3,), metres, is the zero of the descriptor: the keyframe's x and y, and the ground's height below it.
     """
     grid, _ = kernels.polar_bin(points, centre, config.rings, config.sectors, config.radius)
     return {name: channel(name, grid) for name in config.channels}

@@ -42,12 +42,9 @@ _STEPS = 255.0 / np.log(_MAX_SIGMA / _MIN_SIGMA)  # of 3 %
 class Patch:
     """Features of a map around a place."""
 
-    local: Floats32
-    """(C, h, w) of unit norm, zero without map data; cells of 1 m."""
-    sigma: Floats32
-    """(h, w) uncertainty of each cell as a keypoint; meaningless where ``local`` is zero."""
-    corner: Floats
-    """(2,) x and y of the lower corner of cell (0, 0), metres, map frame."""
+    local: Floats32  # (C, h, w) of unit norm, zero without map data; cells of 1 m
+    sigma: Floats32  # (h, w) uncertainty of each cell as a keypoint; meaningless where local is zero
+    corner: Floats  # (2,) x and y of the lower corner of cell (0, 0), metres, map frame
 
 
 class FeatureMap:
@@ -247,10 +244,8 @@ def feature_arrays(
 ) -> tuple[dict[str, npt.NDArray[Any]], dict[str, Any]]:
     """Return the arrays ``learned.*`` of a map, and the parameters ``weights`` and ``cell``.
 
-    Args:
-        points: (N, 3) the map's cloud, metres, z up, relative to the map's origin.
-        progress: called with (windows done, windows).
-        window: metres, a multiple of 32.
+    ``points`` (N, 3) are the map's, metres, z up, relative to its origin. ``progress`` is called with (windows done,
+    windows). ``window`` is in metres, a multiple of 32.
 
     Raises:
         InputError: no weights.
@@ -274,10 +269,8 @@ def feature_arrays(
 def features_of_square(points: Points, corner: Ints, size: int) -> dict[str, npt.NDArray[Any]]:
     """Return the arrays of :func:`feature_arrays` for one square of a map, without ``learned.`` in their names.
 
-    Args:
-        points: (N, 3) of the square and 112 m around it, metres, relative to the map's origin.
-        corner: (2,) its lower corner, multiples of 32 m.
-        size: its edge, a multiple of 32 m.
+    ``points`` (N, 3) are those of the square and 112 m around it, metres, relative to the map's origin. Its lower
+    ``corner`` (2,) and edge ``size`` are multiples of 32 m.
 
     Raises:
         InputError: no weights.

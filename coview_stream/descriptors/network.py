@@ -63,21 +63,16 @@ _Run = Callable[[Callable[[int], None], Iterable[int]], Iterable[None]]
 class Features:
     """A network's outputs for an image (LAYERS, H, W); all three start at its corner."""
 
-    local: Floats32
-    """(C, H / 2, W / 2) of unit norm, independent of heading; cells of 1 m, row along y."""
-    sigma: Floats32
-    """(H / 2, W / 2) uncertainty of each cell as a keypoint, > 0."""
-    place: Floats32
-    """(P, H / 8, W / 8) of unit norm: global descriptors of the surroundings of 4 m cells."""
+    local: Floats32  # (C, H / 2, W / 2) of unit norm, independent of heading; cells of 1 m, row along y
+    sigma: Floats32  # (H / 2, W / 2) uncertainty of each cell as a keypoint, > 0
+    place: Floats32  # (P, H / 8, W / 8) of unit norm: global descriptors of the surroundings of 4 m cells
 
 
 class Network:
     """Encoder of one view, the exported half of :class:`coview_stream.training.networks.PlaceNet`.
 
-    Args:
-        view: the view.
-        directory: of the weights; None takes :func:`weights_directory`.
-        threads: number that shares the strips of a convolution; it does not affect results.
+    Weights come from ``directory``, by default :func:`weights_directory`. ``threads`` share the strips of a
+    convolution; their number does not affect results.
 
     Raises:
         InputError: the directory has no weights, or those of another version or another file.

@@ -78,13 +78,10 @@ class ProtectionLevel:
 def protection_level(
     covariance: Floats, doubt: float = 1.0, risk: float = RISK, others: OtherHeights = NO_OTHER
 ) -> ProtectionLevel:
-    """Return the level of a pose.
+    """Return the level of a pose with a covariance (6, 6) over (x, y, z, roll, pitch, yaw), m2 and rad2.
 
-    Args:
-        covariance: (6, 6) over (x, y, z, roll, pitch, yaw), m2 and rad2.
-        doubt: factor, 1 or more, by which errors may exceed their usual size.
-        risk: probability that an error exceeds the level.
-        others: other possible heights; their variance is part of the covariance.
+    ``doubt``, 1 or more, is the factor by which errors may exceed their usual size, ``risk`` the probability that an
+    error exceeds the level. The variance of ``others``, other possible heights, is part of the covariance.
     """
     known = np.array(covariance)
     known[2, 2] = max(known[2, 2] - others.variance, 0.0)

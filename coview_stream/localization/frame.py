@@ -117,10 +117,8 @@ class FramePreparation:
     def learn_place(self, T_map_cloud: Pose, T_odom_body: Pose, probability: float | None = None) -> Pose:
         """Learn the tilt from a place of the search; return its ``T_map_odom`` (4, 4) with the new calibration.
 
-        Args:
-            T_map_cloud: (4, 4) registered pose of a keyframe's cloud in the sensor's own axes.
-            T_odom_body: (4, 4) corrected odometry of the keyframe.
-            probability: of a place that leads the search; None for an accepted place.
+        ``T_map_cloud`` (4, 4) is the registered pose of a keyframe's cloud in the sensor's axes, ``T_odom_body`` (4, 4)
+        its corrected odometry, ``probability`` that of a place that leads the search; None for an accepted place.
         """
         if probability is None:
             self.estimator.measure_attitude(T_map_cloud, T_odom_body, _PLACE_TILT**2)

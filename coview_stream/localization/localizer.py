@@ -167,14 +167,10 @@ class Localizer(SavedState):
         self, cloud: Reals, T_odom_body: Pose, stamp: float, defer: bool = False,
         on_doubt: Callable[[], None] = lambda: None,
     ) -> SearchRequest | None:  # fmt: skip
-        """Process a frame as :meth:`step` does, with its errors, but without the search.
+        """Process a frame as :meth:`step` does, with its first arguments and its errors, but without the search.
 
-        Args:
-            cloud: see :meth:`step`.
-            T_odom_body: see :meth:`step`.
-            stamp: see :meth:`step`.
-            defer: the caller is behind: while tracking, register every third metre where that suffices.
-            on_doubt: called if the frame contradicts the place, some tenths of a second before the cause is known.
+        With ``defer`` the caller is behind: while tracking, only every third metre is registered where that suffices.
+        ``on_doubt`` is called if the frame contradicts the place, some tenths of a second before the cause is known.
 
         Returns:
             The search request, if any: pass it to a :class:`GlobalSearch` in any thread or process, and its result to
@@ -254,12 +250,10 @@ class Localizer(SavedState):
     # ---- knowledge of the caller
 
     def hint_pose(self, T_map_body: Pose) -> None:
-        """Hint that the robot may be here at the next frame; holds until a place is accepted or :meth:`reset`.
+        """Hint that the robot may be here at the next frame: ``T_map_body`` (4, 4) as :attr:`Fix.T_map_body`.
 
-        The search judges a hint like the last hypothesis of the votes. Hints are ignored while a place is known.
-
-        Args:
-            T_map_body: (4, 4) as :attr:`Fix.T_map_body`.
+        A hint holds until a place is accepted or :meth:`reset`. The search judges it like the last hypothesis of the
+        votes. Ignored while a place is known.
 
         Raises:
             RunError: it is not a finite rigid transform, or not on this planet.
@@ -273,11 +267,8 @@ class Localizer(SavedState):
 
         The search judges the poses of a guess like the descriptors' hypotheses. But ``guess.within`` limits the search
         to a circle, widened by the metres driven, until a place is accepted, another guess comes or the search restarts
-        (:meth:`relocalize`). Guesses are ignored while a place is known.
-
-        Args:
-            guess: of the place.
-            check: refuse a guess where the map has no ground; unchecked, such a circle never leads to a pose.
+        (:meth:`relocalize`). Ignored while a place is known. ``check`` refuses a guess where the map has no ground;
+        unchecked, such a circle never leads to a pose.
 
         Raises:
             InputError: ``guess`` has another type, or the map has no ground there.

@@ -161,11 +161,8 @@ class Fix:
     def carried(self, stamp: float, T_odom_body: Pose, driven: float, turned: float) -> Fix:
         """Return this fix propagated to a later frame by odometry, with the covariance of its drift added.
 
-        Args:
-            stamp: of the later frame, seconds.
-            T_odom_body: (4, 4) raw odometry there.
-            driven: metres from this fix's frame to that one.
-            turned: radians likewise.
+        ``stamp`` in seconds and raw ``T_odom_body`` (4, 4) are the later frame's; from this fix's frame to it the robot
+        has ``driven`` metres and ``turned`` radians.
 
         Raises:
             ValueError: this fix has no pose.

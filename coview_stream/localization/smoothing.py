@@ -80,10 +80,8 @@ class SmoothedPose:
 def smooth_run(localizer: RecordingLocalizer, run: Run, frames: Sequence[RecordedFrame]) -> list[SmoothedPose]:
     """Return the smoothed poses of a recorded run, in order; none without a live pose.
 
-    Args:
-        localizer: which has localized the run; it is reused to track backwards.
-        run: to read the frames without a live pose again.
-        frames: all usable ones; registrations of the backward pass are added.
+    ``localizer``, which has localized the run, is reused to track backwards through frames of ``run`` without a live
+    pose. ``frames`` are all usable ones; registrations of the backward pass are added to them.
     """
     live = [k for k, frame in enumerate(frames) if frame.registered is not None]
     if not live:
@@ -121,10 +119,8 @@ class _Chain:
     calibration: Calibration = field(kw_only=True)
     broken: dict[int, tuple[int, int]] = field(default_factory=dict)
     """Frames whose motion from the previous frame is unknown, with the registered frames before and after."""
-    unknown: set[int] = field(default_factory=set)
-    """Frames at a break that may belong to either side."""
-    refuted: set[int] = field(default_factory=set)
-    """Frames whose scan contradicts the live pose."""
+    unknown: set[int] = field(default_factory=set)  # frames at a break that may belong to either side
+    refuted: set[int] = field(default_factory=set)  # frames whose scan contradicts the live pose
 
     @classmethod
     def of(

@@ -57,10 +57,8 @@ class _Entry(NamedTuple):
 class Segment(NamedTuple):
     """Odometry around a frame."""
 
-    stamps: Ints
-    """(K,) nanoseconds, increasing."""
-    poses: Poses
-    """(K, 4, 4) odometry <- body, metres."""
+    stamps: Ints  # (K,) nanoseconds, increasing
+    poses: Poses  # (K, 4, 4) odometry <- body, metres
 
 
 class OdometryBuffer:

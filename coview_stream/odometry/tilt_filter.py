@@ -203,12 +203,9 @@ def _reweighted(
 ) -> tuple[float, Floats, Floats, list[Floats], list[Floats], list[Floats]]:
     """Find a maximum of the likelihood of an innovation (K,) with several error sources (EM), from ``weights``.
 
-    Args:
-        innovation: sum of a normal part and the errors.
-        normal: (K, K) covariance of the normal part.
-        errors: (2, 2) covariances of the errors with Student's t distribution, all zero for none.
-        ways: (K, 2) Jacobians of the innovation by the errors.
-        weights: initial divisors of the errors' covariances.
+    The innovation is the sum of a ``normal`` part, covariance (K, K), and errors with Student's t distribution, (2, 2)
+    covariances ``errors``, all zero for none, and (K, 2) Jacobians ``ways``. ``weights`` divide their covariances at
+    first.
 
     Returns:
         Minus the log-likelihood up to a constant, the innovation's inverse covariance, its product with the innovation,

@@ -137,10 +137,8 @@ class Calibration:
     def motion_covariance(self, step: Floats, turned: float = 0.0, change: Floats | None = None) -> Floats:
         """Covariance (6, 6) over (rx, ry, rz, x, y, z) of odometry's motion between two clouds, in the step's axes.
 
-        Args:
-            step: (3,) metres.
-            turned: radians about z.
-            change: (3,) of the body's velocities (x, y, rotation about z) over the motion, in the step's axes.
+        ``step`` is (3,) metres, ``turned`` radians about z, ``change`` (3,) that of the body's velocities (x, y,
+        rotation about z) over the motion.
         """
         along = np.concatenate([np.zeros(3), step])
         across = np.concatenate([np.zeros(3), [-step[1], step[0], 0.0]])

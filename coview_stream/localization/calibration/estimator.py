@@ -486,13 +486,9 @@ class CalibrationEstimator:
     ) -> Pose:  # fmt: skip
         """Add a motion between frames measured by the lidar alone (eq. C4); return ``step``, newly corrected.
 
-        Args:
-            motion: (4, 4) of the levelled body.
-            step: (4, 4) odometry's motion, corrected by the calibration of its time.
-            variances: (6,) of odometry's random walk over the step, (rx, ry, rz, x, y, z).
-            sigmas: (6,) of ``motion``, (rx, ry, rz, x, y, z).
-            moments: as in :meth:`measure_motion`.
-            right: probability that the registration has not failed.
+        ``motion`` (4, 4) is the levelled body's, ``step`` (4, 4) odometry's with the calibration of its time.
+        ``variances`` (6,) of odometry's random walk and ``sigmas`` (6,) of ``motion`` are over (rx, ry, rz, x, y, z).
+        ``moments`` are as in :meth:`measure_motion`; ``right`` is the probability that the registration has not failed.
         """
         t, before = step[:3, 3], self.calibration
         applied = np.array([before.roll, before.pitch])

@@ -81,12 +81,8 @@ class FrameMotion:
     ) -> Pose:  # fmt: skip
         """Register a frame to the previous keyframe; return its odometry (4, 4), corrected by the result.
 
-        Args:
-            points: (N, 3) float32, one per voxel, sensor's axes.
-            T_odom_body: (4, 4) odometry, corrected by the estimator's calibration.
-            estimator: receives the motion as a measurement.
-            drift: of odometry.
-            moment: of the frame.
+        ``points`` (N, 3) float32 are one per voxel, in the sensor's axes. ``T_odom_body`` (4, 4) is corrected by the
+        calibration of ``estimator``, which receives the motion as a measurement. ``drift`` is odometry's.
         """
         reference = self._reference
         if reference is not None:

@@ -94,13 +94,9 @@ class GroundChange:
     def without_changed(
         self, cloud: RegistrationCloud, T_map_source: Pose, position: Floats, target: LocalMap
     ) -> RegistrationCloud:
-        """Return a scan without the ground that differs from the survey's, by its predicted pose.
+        """Return a scan without the ground that differs from the survey's, by its predicted pose (4, 4).
 
-        Args:
-            cloud: the scan.
-            T_map_source: (4, 4) its predicted pose. The first scan has the search's pose and is left whole.
-            position: (3,) of the body, the scan's frame.
-            target: the map around.
+        The first scan has the search's pose and is left whole. ``position`` (3,) is the body's in the scan's frame.
         """
         self._scan, self.share, self.metres = cloud, 0.0, 0.0
         if not self._started:
@@ -123,12 +119,8 @@ class GroundChange:
     def learn(self, T_map_source: Pose, position: Floats, target: LocalMap, driven: float, variance: float) -> float:
         """Learn from a believed registration of the newest scan; return the metres by which the robot has to rise.
 
-        Args:
-            T_map_source: (4, 4) the scan's pose, as registered.
-            position: (3,) of the body, the scan's frame.
-            target: the map around.
-            driven: metres since the last call.
-            variance: of the height that odometry has gained since then, metres^2.
+        ``T_map_source`` (4, 4) is the registered pose, ``position`` (3,) the body's in the scan's frame. Since the last
+        call the robot has ``driven`` metres, and odometry's height has gained a ``variance``, metres^2.
         """
         if self._scan is None:
             return 0.0

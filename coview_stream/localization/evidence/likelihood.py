@@ -61,9 +61,7 @@ NUISANCES = (len(KEPT), len(_SURVEYS), len(_LEAKS))
 def log_likelihood_ratios(observed: Floats32, background: Background) -> Floats:
     """Return log-likelihood ratios (P,) of places against chance, summed over the nuisance parameters.
 
-    Args:
-        observed: (P, 7) mean observations at the places, see :class:`Share`; (P, 15) with the outcomes around them.
-        background: shares at chance places.
+    ``observed`` (P, 7) are mean observations, see :class:`Share`; (P, 15) with the outcomes around the places.
     """
     if not len(observed):
         return np.empty(0)
@@ -149,18 +147,14 @@ class Posterior:
 
 
 def posterior(ratios: Floats, votes: Ints, count: int, starts: int = 1, variances: Floats | None = None) -> Posterior:
-    """Return the posterior of places.
+    """Return the posterior of places with log-likelihood ratios (P,) against chance and vote ranks (P,) from 0.
+
+    ``count`` is the number N of scored places, including these: the others have the likelihood of chance. ``starts`` is
+    the number of starts of the search since a place was accepted, ``variances`` (P,) are of the ratios, default none.
 
     It may be evaluated after every keyframe: where every place is wrong the odds of all places together are a
     martingale, so they ever exceed 1 / e with probability e at most (Ville's inequality). Each restart of a search is
     another chance of an error; as the inverse squares are summable, all starts together have less than 2 e.
-
-    Args:
-        ratios: (P,) log-likelihood ratios against chance.
-        votes: (P,) ranks in the votes, from 0.
-        count: number N of scored places, including these: the others have the likelihood of chance.
-        starts: number of starts of the search since a place was accepted.
-        variances: (P,) of the ratios; none by default.
     """
     ranks = np.minimum(votes, max(count, 1) - 1)
     # two recognizers rank places, and followed places keep their ranks: their sum may exceed that of one list

@@ -47,12 +47,9 @@ NO_PART = MovedPart(0.0, 0.0)
 
 
 def find_moved_part(field: kernels.FieldMap, scans: Sequence[ObservedScan], T_map_odom: Floats) -> MovedPart:
-    """Search for a part of the scans that is unexplained at a place and fits at one shift of it.
+    """Search for a part of the scans (newest last) that is unexplained at a place and fits at one shift of it.
 
-    Args:
-        field: the map's likelihood field.
-        scans: of the newest keyframes, the newest last.
-        T_map_odom: (4, 4) the place, registered at the newest keyframe: its lean is the sensor's and turns with it.
+    ``T_map_odom`` (4, 4) is the place, registered at the newest keyframe: its lean is the sensor's and turns with it.
     """
     place = scans[-1].poses(T_map_odom[None])[0]
     place[3] = 0.0  # from here on points are relative to the body, along the map's axes
@@ -122,9 +119,7 @@ def _explained(field: kernels.FieldMap, points: Points, structure: Points, shift
 def _log_likelihood_ratios(fits: Floats, usual: Floats) -> Floats:
     """Return the log-ratios (H,) of "a share of the patches belongs here" against "they fit by chance".
 
-    Args:
-        fits: (P, H) explained shares of the patches at the shifts.
-        usual: (P,) their chance shares.
+    ``fits`` (P, H) are explained shares of the patches at the shifts, ``usual`` (P,) their chance shares.
     """
     share = _AGREEING[:, None] * _FITS + (1.0 - _AGREEING[:, None]) * usual  # (Q, P)
     table = np.log(share / usual) @ fits + np.log((1.0 - share) / (1.0 - usual)) @ (1.0 - fits)

@@ -117,10 +117,8 @@ class OpenPlaces:
     def share(self, chance: Floats32, background: Background, leader: Floats | None = None) -> Floats:
         """Return the probability (Q, L) that a chance place is open, by nuisance values.
 
-        Args:
-            chance: (P, 7) observations at scored places more than :data:`SIGHT` from the leader.
-            background: of the other shares.
-            leader: x, y, ... of the leader; stations within :data:`SIGHT` of it are ignored as well.
+        ``chance`` (P, 7) are observations at scored places more than :data:`SIGHT` from the leader (x, y, ...);
+        stations as near to ``leader`` are ignored, too. ``background`` is that of the other shares.
         """
         self._look_back(background)
         weights, count = self._drives.weights.astype(np.float32), float(self._count)

@@ -76,10 +76,8 @@ class RegistrationCloud:
 def prepare_scan(points: Points, position: Floats, config: RegistrationConfig) -> RegistrationCloud:
     """Thin a local scan to at most ``source_points`` points within ``source_range`` metres of ``position``.
 
-    Args:
-        points: (N, 3) float32 in a gravity-aligned frame, metres.
-        position: (3,) of the body, same frame.
-        config: range, voxel and number of points; the choice is random but seeded.
+    Points (N, 3) float32 and the body's ``position`` (3,) are in a gravity-aligned frame, metres. The choice of points
+    is random but seeded.
     """
     thin = thinned(points, position, config)
     height, cell = _heights(thin)

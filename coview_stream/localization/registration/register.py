@@ -104,11 +104,8 @@ def remove_prior(registration: Registration, prior: Prior, config: RegistrationC
     Gauss-Newton's model of the pairs alone has its minimum H^-1 a P d further on. Directions with less than a hundredth
     of the information from the pairs stay near the prior's mean and keep that little information.
 
-    Args:
-        registration: its pose may be replaced by another frame's (``T_map_body`` for ``T_map_odom``), as rotations are
-            about the body in any case.
-        prior: of the same frame.
-        config: of the registration.
+    Poses of registration and prior may be of another frame (``T_map_body`` for ``T_map_odom``), as rotations are about
+    the body in any case. ``config`` is the registration's.
 
     Raises:
         InputError: the information is not finite, or leaves a direction unconstrained in spite of the prior.
@@ -134,15 +131,12 @@ def remove_prior(registration: Registration, prior: Prior, config: RegistrationC
 def registration_covariance(information: Floats, config: RegistrationConfig) -> Floats:
     """Return a registration's covariance from its Hessian: inflated, widened in weak directions, with a floor.
 
-    The inverse Hessian is optimistic, as neighbouring points are not independent: its sigma is multiplied by
-    ``inflation``. Where the map hardly constrains a direction (along a tunnel, on a bare field) the Hessian comes from
-    noise in the normals. In comparable units, metres and metres at a lever arm of ``WEAK_LEVER``, a direction's sigma s
-    becomes s sqrt(1 + (s / w)^2), w = ``WEAK_FROM``: it stays the same well below w, and grows with its square far
-    above, up to ``WEAK_SIGMA``, the sigma without any information. Finally ``SIGMA_FLOOR`` is added.
-
-    Args:
-        information: (6, 6) of the pairs alone (:func:`remove_prior`), before inflation.
-        config: with the inflation.
+    ``information`` (6, 6) is of the pairs alone (:func:`remove_prior`). Its inverse is optimistic, as neighbouring
+    points are not independent: the sigma is multiplied by ``inflation``. Where the map hardly constrains a direction
+    (along a tunnel, on a bare field) the Hessian comes from noise in the normals. In comparable units, metres and
+    metres at a lever arm of ``WEAK_LEVER``, a direction's sigma s becomes s sqrt(1 + (s / w)^2), w = ``WEAK_FROM``: it
+    stays the same well below w, and grows with its square far above, up to ``WEAK_SIGMA``, the sigma without any
+    information. Finally ``SIGMA_FLOOR`` is added.
 
     Raises:
         InputError: ``information`` is not a finite (6, 6) matrix.

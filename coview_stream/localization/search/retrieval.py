@@ -217,12 +217,10 @@ class StationConsensus:
         self._voted = None
 
     def vote(self, centre: Floats, query: Mapping[Channel, Descriptor], area: Circle | None = None) -> None:
-        """Add one keyframe's vote; another ``area`` than the last vote's restarts the consensus.
+        """Add one keyframe's vote by descriptors (R, S) of all channels; another ``area`` restarts the consensus.
 
-        Args:
-            centre: (3,) zero of the descriptors, z on the ground; odometry frame, metres.
-            query: descriptors (R, S) by channel.
-            area: circle of compared stations, metres from the map's zero; None for all.
+        ``centre`` (3,) is the zero of the descriptors, z on the ground; odometry frame, metres. ``area`` is the circle
+        of compared stations, metres from the map's zero; None for all.
         """
         if self._voted is None or area != self._area:
             self._area = area

@@ -193,14 +193,9 @@ class PlaceScorer:
     ) -> Scored:
         """Observe the map from a keyframe's hypotheses and from the followed places.
 
-        Of hypotheses within 2 m and 5 degrees of each other only the best counts.
-
-        Args:
-            hypotheses: of ``T_map_odom``; the last ``hints`` are pose hints.
-            votes: ranks of the hypotheses in their votes, from 0; any number for a hint.
-            hints: number of pose hints.
-            scan: of the keyframe.
-            prior: log-probability of this reading of the scan, added to the ratios of its places.
+        Of hypotheses within 2 m and 5 degrees of each other only the best counts. The last ``hints`` hypotheses are
+        pose hints. ``votes`` are the ranks of the hypotheses in their votes, from 0, any number for a hint. ``prior``,
+        the log-probability of this reading of the scan, is added to the ratios of its places.
         """
         followed, voted = self._followed, len(hypotheses) - hints
         count = len(followed.hypotheses)

@@ -144,14 +144,10 @@ class EvidenceBaseline:
 class Ruling(NamedTuple):
     """Consequence of a registration for the place, given the earlier ones."""
 
-    event: Event | None
-    """For the robot's state; None for no change."""
-    reason: str
-    """One clause."""
-    wrong: float
-    """Probability that the place is wrong."""
-    believed: bool
-    """Whether the registration may correct the pose."""
+    event: Event | None  # for the robot's state; None for no change
+    reason: str  # one clause
+    wrong: float  # probability that the place is wrong
+    believed: bool  # whether the registration may correct the pose
 
 
 class LossMonitor:

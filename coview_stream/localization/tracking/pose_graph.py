@@ -60,8 +60,7 @@ _MAX_UPDATES = 3  # more would move the newest pose by less than a hundredth of 
 class Estimate(NamedTuple):
     """A pose and its covariance."""
 
-    T_map_body: Pose
-    """(4, 4) float64."""
+    T_map_body: Pose  # (4, 4) float64
     covariance: Floats
     """(6, 6) over (rx, ry, rz, x, y, z): a rotation about the body, then a shift, along the map's axes."""
 

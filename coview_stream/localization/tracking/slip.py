@@ -120,13 +120,9 @@ class DisplacementCheck:
     usual: float | None = None  # share in [0, 1]; None before the first registration
 
     def learn(self, points: Points, position: Floats, T: Pose, target: LocalMap) -> None:
-        """Add a frame with a verified registration; with others a slow error would become usual.
+        """Add a frame with a verified registration ``T`` (4, 4), map <- frame; others would make a slow error usual.
 
-        Args:
-            points: (N, 3) float32 of the frame, gravity-aligned, metres.
-            position: (3,) of the sensor, same frame.
-            T: (4, 4) map <- that frame, as registered.
-            target: the map around it.
+        Its points (N, 3) float32 and the sensor's ``position`` (3,) are gravity-aligned, metres.
         """
         share = share_on_map(points, position, T, target)
         if share is not None:

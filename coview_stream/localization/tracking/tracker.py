@@ -148,13 +148,11 @@ class Tracker:
     ) -> MapMatch:  # fmt: skip
         """Register the newest scans from the predicted pose (eq. 13), verify and judge.
 
-        Args:
-            cloud: (N, 3) the newest frame, already added, in the sensor's axes.
-            T_odom_body: (4, 4) its odometry.
-            standing_still: use only frames since the last registration, and trust odometry slightly less: repeated
-                views of a standing robot must not add up to certainty.
-            newest_only: use only the newest frame, as the frames are in doubt.
-            on_doubt: called if the place is contradicted, some tenths of a second before the search around it is done.
+        ``cloud`` (N, 3) is the newest frame, already added, in the sensor's axes, ``T_odom_body`` (4, 4) its odometry.
+        ``standing_still`` uses only frames since the last registration, and trusts odometry slightly less, as repeated
+        views of a standing robot must not add up to certainty. ``newest_only`` uses only the newest frame, if the
+        frames are in doubt. ``on_doubt`` is called if the place is contradicted, some tenths of a second before the
+        search around is done.
         """
         belief = self._predict(T_odom_body, standing_still)
         self._scans.keep_newest(1 if newest_only else max(1, self._unregistered) if standing_still else MAX_FRAMES)

@@ -59,13 +59,9 @@ class FeatureVote:
     ) -> None:
         """Compare with a map.
 
-        Args:
-            centre: see the attribute.
-            raster: the map's features and mask of cells, with a margin of half an image.
-            cells: of the stations.
-            images: the query's features and weight at all shifts.
-            candidates: stations and shifts (N,).
-            groups: (N,) group numbers; only the best of each group remains a candidate.
+        ``raster`` has the map's features and mask of cells, with a margin of half an image, ``images`` the query's
+        features and weight at all shifts. Of ``candidates``, stations and shifts (N,), only the best of each group (N,)
+        remains.
         """
         self.centre = centre
         self._images = images
@@ -173,14 +169,10 @@ class TurnedQuery:
 
 
 def turn_query(local: Floats32, weight: Floats32, rasters: FeatureRasters, ratio: int, yaws: Floats) -> TurnedQuery:
-    """Rotate a query to headings.
+    """Rotate a query's features (C, H, W) with cell weights (H, W) to headings ``yaws`` (S,).
 
-    Args:
-        local: (C, H, W) features.
-        weight: (H, W) of the cells.
-        rasters: of the map.
-        ratio: number of query cells along the edge of a fine map cell.
-        yaws: (S,) an even number; the second half is opposite to the first.
+    ``ratio`` is the number of query cells along the edge of a fine map cell. S is even, and the second half of the
+    headings is opposite to the first.
     """
     reduced, shares = downsample(np.tensordot(rasters.axes, local, 1), weight, ratio)
     half = len(yaws) // 2
