@@ -174,7 +174,7 @@ class GlobalSearch:
         return levelled_by_frame(leader.T_map_odom, request, self.config.registration, self._local_maps)
 
     def _leaning(self, upright: Reading, hypotheses: list[Hypothesis], ranks: list[int], hints: int) -> Reading | None:
-        """Return the reading of the scan by the leader's lean; None if that has no other result.
+        """Return the reading of the scan by the leader's lean; None for a small lean, or if it leads to another place.
 
         A sensor leans alike at all places: all are scored again by this keyframe alone, among chance places of the same
         lean. As the lean was fitted, the reading counts with the lean's prior probability, and that of a later keyframe
