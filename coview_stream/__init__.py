@@ -5,10 +5,10 @@
 >>> fix = localizer.step(cloud, T_odom_body, stamp)          # doctest: +SKIP
 
 Maps: :class:`BaseMap`, :class:`MapConfig`, :func:`fetch_map`, :func:`read_cloud`. Localization: :class:`Localizer`,
-:class:`AsyncLocalizer`, :class:`LocalizerConfig`, :class:`Fix`, :func:`open_run` for recorded runs. A robot of a node:
-:class:`RobotClient`, :class:`PoseMessage`. Errors: :class:`CoViewError` and those below it.
+:class:`AsyncLocalizer`, :class:`LocalizerConfig`, :class:`Fix`, :func:`open_run` for recorded runs. Client of a node:
+:class:`RobotClient`, :class:`PoseMessage`. Errors: :class:`CoViewError` and its subclasses.
 
-Names are loaded when they are first used: importing the package costs next to nothing.
+Names are loaded on first use: importing the package costs next to nothing.
 """
 
 from __future__ import annotations

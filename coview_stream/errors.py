@@ -1,4 +1,4 @@
-"""Errors of the package, as one tree, and the import of libraries that only some installations have.
+"""Errors of the package, as one tree, and the import of optional libraries.
 
 Every message names the file, field or key and the remedy. The command prints it as one line and exits with 2.
 """
@@ -17,7 +17,7 @@ from typing import Any
 
 
 def printable(text: object) -> str:
-    """Return text of anyone's file or message in a form safe for a terminal: no control characters, one line."""
+    """Return text from anyone's file or message in a form safe for a terminal: no control characters, one line."""
     return "".join(c if c.isprintable() else " " for c in str(text))
 
 
@@ -27,7 +27,7 @@ def counted(count: int, noun: str) -> str:
 
 
 class CoViewWarning(UserWarning):
-    """Input that is used but may not be meant. The message is one sentence, which the command prints as one line."""
+    """Input that is used but may be a mistake. The message is one sentence, which the command prints as one line."""
 
 
 class CoViewError(Exception):
@@ -39,7 +39,7 @@ class ConfigError(CoViewError, ValueError):
 
 
 class InputError(CoViewError, ValueError):
-    """Something the caller handed over cannot be used."""
+    """Input cannot be used: an argument, a file or a message."""
 
 
 class CloudError(InputError):
@@ -47,7 +47,7 @@ class CloudError(InputError):
 
 
 class RunError(InputError):
-    """A run's frames, odometry or stamps do not fit together."""
+    """A run's frames, odometry or stamps do not match."""
 
 
 class MapError(InputError):
@@ -55,7 +55,7 @@ class MapError(InputError):
 
 
 class MessageError(InputError):
-    """A message from the network is malformed: truncated, oversized, or unlike its encoding."""
+    """A message from the network is malformed: truncated, oversized, or not in its stated encoding."""
 
 
 class EncodingError(MessageError):
@@ -85,7 +85,7 @@ def did_you_mean(given: str, known: Sequence[str]) -> str:
 
 
 PIP_INSTALL = f"{shlex.quote(sys.executable or 'python')} -m pip install"
-"""Command that installs for the running interpreter; a bare ``pip`` may be another one's."""
+"""Command that installs for the running interpreter; a bare ``pip`` may belong to another one."""
 
 EXTRA_OF = {
     "scipy": "node",
@@ -113,11 +113,11 @@ EXTRA_OF = {
     "psutil": "bench",
     "rclpy": "ros2",
 }
-"""Extra of the package that brings a module of others, by its first name."""
+"""Extra that installs a third-party module, by its top-level name."""
 
 
 def require_library(module: str, requirement: str, purpose: str) -> Any:
-    """Import a module that one of the package's extras brings; raises DependencyError if it cannot be loaded.
+    """Import a module of one of the package's extras; DependencyError if it cannot be loaded.
 
     ``requirement`` is its distribution with the minimum version, as in the extra; ``purpose`` is for the message.
     """
@@ -133,7 +133,7 @@ def require_library(module: str, requirement: str, purpose: str) -> Any:
 
 
 def require_installed(module: str, purpose: str) -> None:
-    """Raise DependencyError if a module that an extra brings is not there; it is not imported."""
+    """Raise DependencyError if a module of an extra is missing; it is not imported."""
     if find_spec(module) is None:
         raise DependencyError(_not_installed(module, purpose, EXTRA_OF[module]))
 
@@ -142,7 +142,7 @@ def require_installed(module: str, purpose: str) -> None:
 def naming_missing_libraries(purpose: str, extra: str | None = None) -> Iterator[None]:
     """Turn the ImportError of a module into a :class:`DependencyError` that names an extra.
 
-    ``purpose`` is for the message; ``extra`` brings all modules needed, by default the one that brings this module.
+    ``purpose`` is for the message; ``extra`` installs all modules needed, by default the one with this module.
     """
     try:
         yield
@@ -154,10 +154,10 @@ def naming_missing_libraries(purpose: str, extra: str | None = None) -> Iterator
 
 
 def install_command(extra: str) -> str:
-    """Return the command that installs an extra from where this package came: a checkout, a wheel, an address.
+    """Return the command that installs an extra from this package's source: a checkout, a wheel, an address.
 
-    Its bare name is not enough: an index may lack it, or have another of that name. A package from an index is
-    named with its version, which pip finds installed and does not look for.
+    The bare name is not enough: an index may lack it, or have another package of that name. A package from an index is
+    named with its version, which pip finds installed and does not search for.
     """
     from importlib.metadata import PackageNotFoundError, distribution
     from json import loads

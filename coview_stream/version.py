@@ -1,3 +1,3 @@
-"""The version, apart from the package so that nothing below has to import upward."""
+"""The version, outside the package's __init__ so that no module has to import upward."""
 
 __version__ = "0.1.0"

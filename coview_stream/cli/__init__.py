@@ -1,10 +1,10 @@
 """The ``coview-stream`` command: one thin module per subcommand, one line per error.
 
-A command module offers ``HELP: str``, ``add_arguments(parser)`` and ``run(args) -> int``. Heavy libraries are
-imported inside ``run``: ``coview-stream --help`` must answer at once.
+A command module has ``HELP: str``, ``add_arguments(parser)`` and ``run(args) -> int``. Heavy libraries are imported
+inside ``run``, because ``coview-stream --help`` must answer at once.
 
-Exit codes: 0 done; 1 could not localize (files are written all the same), no subscriber (replay), a check failed
-(doctor); 2 bad usage or input; 130 interrupted; 141 the reader of a pipe went away.
+Exit codes: 0 done; 1 could not localize (files are still written), no subscriber (replay), a check failed (doctor);
+2 bad usage or input; 130 interrupted; 141 the reader of a pipe went away.
 """
 
 from __future__ import annotations
@@ -43,20 +43,20 @@ COMMANDS = (
 _MODULES = {"eval": "evaluate", "serve-map": "serve_map"}  # a module called eval would shadow the builtin
 
 _COMPLETE_FILE = {"bash": "_shtab_compgen_files", "zsh": "_files", "fish": "(__fish_complete_path (commandline -ct))"}
-"""Completion of a file name, as ``shtab coview_stream.cli.build_parser`` reads it from an argument."""
+"""File name completion, which ``shtab coview_stream.cli.build_parser`` reads from an argument."""
 
 _MEANT = {"--unit": "--crs", "--units": "--crs", "--feet": "--crs", "--lidar": "--sensor"}
-"""Options that people try, and the one that they mean."""
+"""Options that people try, and the ones that they mean."""
 
 _EXTRAS = {"build": "build", "airborne": "build", "simulate": "build", "demo": "all", "train": "learn-train"}
-"""Extras with the libraries of a command; other commands name what they lack themselves."""
+"""Extras with a command's libraries; other commands name missing ones themselves."""
 
 
 class _Parser(argparse.ArgumentParser):
-    """Parser that raises bad usage as an error, like any other bad input, instead of printing it and exiting."""
+    """Parser that raises bad usage as an error, like other bad input, instead of printing it and exiting."""
 
     def format_help(self, everything: bool = False) -> str:
-        """Return the help, without the rare options unless ``everything`` is asked for."""
+        """Return the help, without the rare options unless ``everything`` is set."""
         hidden = [] if everything else [action for action in self._actions if getattr(action, "rare", False)]
         texts = [action.help for action in hidden]
         for action in hidden:
@@ -75,11 +75,11 @@ class _Parser(argparse.ArgumentParser):
 def main(argv: Sequence[str] | None = None) -> int:
     """Run one command and return its exit code; ``argv`` defaults to the process's arguments.
 
-    Errors of this package and of the system become one line on stderr and exit code 2; others are bugs and are raised.
+    Errors of this package and the system become one line on stderr and exit code 2; others are bugs and are raised.
     """
-    # our matrices are small: BLAS threads cost more than they bring, most of all beside other programs
+    # our matrices are small: BLAS threads cost more than they gain, above all beside other programs
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
-    sys.stdout = sys.stdout or _null()  # closed by who called: Python then has none
+    sys.stdout = sys.stdout or _null()  # None if the caller closed it
     sys.stderr = sys.stderr or _null()
     try:
         with interruptible(whole_process=argv is None) as interrupt, warnings.catch_warnings():
@@ -103,14 +103,14 @@ def _main(argv: Sequence[str] | None) -> tuple[int, str | None]:
     """Return the exit code and the error."""
     try:
         code = _dispatch(sys.argv[1:] if argv is None else list(argv))
-        sys.stdout.flush()  # a closed pipe must show up here, not while the interpreter shuts down
+        sys.stdout.flush()  # a closed pipe must show up here, not at interpreter shutdown
         return code, None
     except CoViewError as error:
         return 2, str(error)
     except MemoryError:
         return 2, "out of memory; use a smaller map or a coarser voxel size"
     except BrokenPipeError:
-        with contextlib.suppress(OSError, ValueError):  # or the interpreter would report the closed pipe at its exit
+        with contextlib.suppress(OSError, ValueError):  # otherwise the interpreter reports the closed pipe at exit
             os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return 141, None
     except OSError as error:
@@ -119,7 +119,7 @@ def _main(argv: Sequence[str] | None) -> tuple[int, str | None]:
 
 
 def _joined(argv: Sequence[str]) -> list[str]:
-    """Return the arguments with ``--option -1,2`` as ``--option=-1,2``, for argparse takes that for an option."""
+    """Return the arguments with ``--option -1,2`` as ``--option=-1,2``: argparse takes the value for an option."""
     found: list[str] = []
     for word in argv:
         before = found[-1] if found else ""
@@ -131,7 +131,7 @@ def _joined(argv: Sequence[str]) -> list[str]:
 
 
 def build_parser(only: str | None = None) -> argparse.ArgumentParser:
-    """Return the parser with all commands, or with one: the others' modules need not be imported to run that."""
+    """Return the parser with all commands, or with one, which does not import the modules of the others."""
     parser = _Parser(
         prog=PROGRAM,
         description="Tells a robot where it is on a base map, by lidar: no GPU, no GNSS, no initial guess.",
@@ -150,9 +150,9 @@ def build_parser(only: str | None = None) -> argparse.ArgumentParser:
 
 
 def _check_options(words: list[str], known: list[str], command: str) -> None:
-    """Refuse a long option that is none of a command's, nor the beginning of one (ConfigError).
+    """Refuse a long option that is neither a command's nor the beginning of one (ConfigError).
 
-    Those behind ``--`` and ``--ros-args`` are not the command's.
+    Options after ``--`` and ``--ros-args`` are not the command's.
     """
     for word in itertools.takewhile(lambda word: word not in ("--", "--ros-args"), words):
         option = word.partition("=")[0]
@@ -170,7 +170,7 @@ def _dispatch(argv: list[str]) -> int:
     if name not in COMMANDS and not name.startswith("-"):
         raise ConfigError(f"there is no command {name!r}; {did_you_mean(name, COMMANDS)} `{PROGRAM} help` lists them")
     parser = build_parser(name if name in COMMANDS else None)
-    if name in COMMANDS:  # before argparse, which names other mistakes first
+    if name in COMMANDS:  # before argparse, which reports other mistakes first
         (commands,) = (action.choices for action in parser._actions if action.dest == "command")
         _check_options(argv[1:], [option for a in commands[name]._actions for option in a.option_strings], name)  # type: ignore[index]  # a dictionary
     try:

@@ -1,7 +1,7 @@
-"""``coview-stream airborne``: an airborne-like point cloud of a survey that was taken on the ground.
+"""``coview-stream airborne``: a point cloud as from the air, made from a ground survey.
 
-A command of its own and no option of ``simulate``: a cloud goes in and a cloud comes out, to ``build`` a map of; there
-is no robot, no truth, and nothing of a simulated world's options applies.
+A separate command instead of an option of ``simulate``: it turns a cloud into a cloud, from which ``build`` makes a
+map; it has no robot and no truth, and none of a simulated world's options apply.
 """
 
 from __future__ import annotations

@@ -38,9 +38,9 @@ Clouds: TypeAlias = "Sequence[str | os.PathLike[str]]"
 
 _FIELDS = {"block_size": "block"}
 _STDIN = {"-", "/dev/stdin", "/dev/fd/0"}
-_MAX_WORKERS = 8  # by default: each may take 2 GB
+_MAX_WORKERS = 8  # default: each may take 2 GB
 
-# of two airborne towns, 1.0 and 1.5 km2 of 3.6 and 3.2 points/m2, on two cores
+# measured on two airborne towns, 1.0 and 1.5 km2 at 3.6 and 3.2 points/m2, on two cores
 _SECONDS_PER_POINT, _SECONDS_PER_KM2 = 12e-6, 78.0
 _GB_PER_KM2, _TILES_GB_PER_KM2 = 0.37, 0.09
 _WORTH_SAYING = 30.0  # seconds
@@ -123,14 +123,14 @@ def run(args: argparse.Namespace) -> int:
 
 
 def _announce(clouds: Clouds, tiles: bool) -> None:
-    """Say on stderr how long it will take and how large the map will be, where the files' heads tell."""
+    """Print on stderr how long the build takes and how large the map gets, if the file headers say enough."""
     import numpy as np
 
     from coview_stream.basemap.sources import sources_of
     from coview_stream.errors import CoViewError, CoViewWarning
 
     with warnings.catch_warnings():
-        warnings.simplefilter("ignore", CoViewWarning)  # the build reads the heads again, and tells
+        warnings.simplefilter("ignore", CoViewWarning)  # the build reads the headers again, and warns
         try:
             heads = [source.head() for source in sources_of(clouds)]
         except CoViewError:
@@ -200,7 +200,7 @@ def _build_site(
 
 
 def _tell(covered: MapSummary, crs: str | None) -> None:
-    """Print a summary, which does not ask for the unit where ``--crs`` has stated it."""
+    """Print a summary, which does not ask for the unit if ``--crs`` has stated it."""
     for warning in covered.warnings:
         warn(warning)
     print(replace(covered, crs=f"unknown, converted from {crs}") if crs in ("feet", "us-feet") else covered)
@@ -208,12 +208,12 @@ def _tell(covered: MapSummary, crs: str | None) -> None:
 
 @contextlib.contextmanager
 def local_clouds(given: Sequence[str], window: str | None) -> Iterator[list[str | os.PathLike[str]]]:
-    """Yield local files of clouds; those of web servers, stdin (``-``) and windows of COPC files are temporary.
+    """Yield local cloud files; those from web servers, stdin (``-``) and windows of COPC files are temporary.
 
-    ``window`` is ``X0,Y0,X1,Y1`` of all clouds; None takes whole files.
+    ``window`` is ``X0,Y0,X1,Y1`` for all clouds; None takes whole files.
 
     Raises:
-        ConfigError: a malformed window. CloudError: a file cannot be fetched, or is no COPC file and has a window.
+        ConfigError: a malformed window. CloudError: a file cannot be fetched, or has a window but is not a COPC file.
     """
     if not _STDIN.isdisjoint(given):
         with tempfile.TemporaryDirectory(prefix="coview-clouds-") as folder:
@@ -221,7 +221,7 @@ def local_clouds(given: Sequence[str], window: str | None) -> Iterator[list[str 
             try:
                 with local_clouds([read if name in _STDIN else name for name in given], window) as clouds:
                     yield clouds
-            except CoViewError as error:  # names the temporary file, which the user does not know
+            except CoViewError as error:  # it names the temporary file, which the user does not know
                 raise type(error)(str(error).replace(read, "stdin")) from error
         return
     from coview_stream.clouds.fetch import Window, fetch_cloud, is_web_address
@@ -250,7 +250,7 @@ def local_clouds(given: Sequence[str], window: str | None) -> Iterator[list[str 
 
 
 def _read_stdin(folder: Path) -> Path:
-    """Write the cloud on stdin into a folder, named by its first bytes; CloudError if they are of no format."""
+    """Write the cloud on stdin into a folder, named by its first bytes; CloudError if they fit no format."""
     from coview_stream.clouds.files import suffix_of_content
     from coview_stream.errors import CloudError
 

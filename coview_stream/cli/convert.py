@@ -1,4 +1,4 @@
-"""``coview-stream convert``: a directory of tiles to one map file, the other way round, and light copies."""
+"""``coview-stream convert``: a directory of tiles to one map file, the reverse, and light copies."""
 
 from __future__ import annotations
 

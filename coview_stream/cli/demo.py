@@ -1,6 +1,6 @@
-"""``coview-stream demo``: the whole way from a laser scan to live poses, without input files or other machines.
+"""``coview-stream demo``: the whole path from a laser scan to live poses, without input files or other machines.
 
-A node, a robot and a watcher run as processes of their own on the loopback interface.
+A node, a robot and a watcher run as separate processes on the loopback interface.
 """
 
 from __future__ import annotations
@@ -51,7 +51,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    """Do the four steps, write what came out, print the errors."""
+    """Run the four steps, write the results, print the errors."""
     from coview_stream.basemap.basemap import BaseMap
     from coview_stream.cli.evaluate import table
     from coview_stream.clouds.atomic_file import atomic_file
@@ -92,11 +92,7 @@ def run(args: argparse.Namespace) -> int:
 
 
 def _prepare_folder(out: Path) -> None:
-    """Create the directory, or clear it of an earlier demo's results.
-
-    Raises:
-        InputError: it holds other files, or cannot be written.
-    """
+    """Create the directory, or clear it of an earlier demo; InputError if it has other files or is not writable."""
     from coview_stream.errors import InputError
 
     if out.exists() and not out.is_dir():
@@ -113,7 +109,7 @@ def _prepare_folder(out: Path) -> None:
 
 @contextlib.contextmanager
 def _step(seconds: dict[str, float], name: str, text: str) -> Iterator[None]:
-    """Print on stderr what the block does and, at its end, how long it took; enter its seconds by name."""
+    """Print on stderr what the block does and, at its end, how long it took; store its seconds by name."""
     number = len(seconds) + 1
     print(f"[{number}/{_STEPS}] {text} ...", file=sys.stderr, flush=True)
     begin = time.perf_counter()
@@ -149,7 +145,7 @@ def _live(recorded: Run, out: Path, shown: bool, web: str | None) -> RunResult:
 
 
 def _write_results(located: RunResult, base_map: BaseMap, truth: Trajectory, out: Path) -> Evaluation:
-    """Write trajectory, evidence and pictures; return the evaluation of what was written."""
+    """Write trajectory, evidence and pictures; return the evaluation of the trajectory."""
     from coview_stream.clouds.trajectory import read_tum
     from coview_stream.localization.offline import write
     from coview_stream.report.evaluation import evaluate, frame_errors
@@ -168,7 +164,7 @@ def _write_results(located: RunResult, base_map: BaseMap, truth: Trajectory, out
 ROBOT = "demo"
 
 # seconds
-_MAX_START = 300.0  # until the node publishes something: a first run compiles its kernels; the robot waits for the rest
+_MAX_START = 300.0  # until the node publishes: a first run compiles its kernels; the robot waits for the rest
 _MAX_SHUTDOWN = 5.0  # for a process after a signal
 _IN_TRANSIT = 0.3  # for the last frame and its pose after the robot has ended
 
@@ -180,10 +176,10 @@ def record_live(
     on_record: Callable[[dict[str, Any]], None] = lambda record: None,
     web: str | None = None,
 ) -> tuple[list[dict[str, Any]], list[dict[str, Any]]]:
-    """Serve a map, replay a run to it at its own pace; return the poses and the statuses published, JSON, in order.
+    """Serve a map and replay a run to it at its own pace; return the published poses and statuses, JSON, in order.
 
     ``logs`` is the directory for the stderr of the three processes, ``on_record`` is called with every pose and status
-    as they come, ``web`` is the ``HOST:PORT`` of a web page of the drive.
+    on arrival, ``web`` is the ``HOST:PORT`` of a web page of the drive.
 
     Raises:
         TransportError: a process failed; the message ends with the last line of its log.
@@ -245,7 +241,7 @@ def _process(log: Path, *args: str) -> Iterator[subprocess.Popen[bytes]]:
             stdout=subprocess.PIPE if args[0] == "watch" else subprocess.DEVNULL,
             stderr=errors,
             env=python_environment(),
-            start_new_session=True,  # this process passes an interrupt at the terminal on
+            start_new_session=True,  # this process passes on an interrupt at the terminal
         )
         try:
             yield process

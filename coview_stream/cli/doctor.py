@@ -58,7 +58,7 @@ def run(args: argparse.Namespace) -> int:
     for finding in _findings(args, keys):
         findings.append(finding)
         if not args.json:
-            print(finding.line(), flush=True)  # the next one may take seconds
+            print(finding.line(), flush=True)  # the next finding may take seconds
     if args.json:
         print(json.dumps({"format": 1, "findings": [finding.to_json() for finding in findings]}, indent=1))
     elif any(finding.verdict != "ok" for finding in findings):
@@ -75,7 +75,7 @@ def _robot_keys(args: argparse.Namespace) -> list[RobotKeys]:
         raise ConfigError(f"--seconds {args.seconds!r}: give a number above 0, {_MAX_SECONDS:g} at most")
     check_codec("--cloud-encoding", args.cloud_encoding, CLOUD_CODECS)
     check_codec("--odometry-encoding", args.odometry_encoding, ODOMETRY_CODECS)
-    names = dict.fromkeys(args.robot or ["any"])  # one robot at least, to check the keys
+    names = dict.fromkeys(args.robot or ["any"])  # at least one robot, to check the keys
     keys = [
         robot_keys(args.preset, args.base, name, args.cloud_key, args.odometry_key, None, args.domain) for name in names
     ]
@@ -92,13 +92,13 @@ def _findings(args: argparse.Namespace, keys: list[RobotKeys]) -> Iterator[Findi
     from coview_stream.stream.transport.zenoh_config import compose
     from coview_stream.stream.transport.zenoh_transport import DEFAULT_ENDPOINT
 
-    connect = None  # the network is not asked for
+    connect = None  # no network checks were requested
     if args.robot or args.connect or args.listen or args.zenoh_config:
         connect = args.connect or ([] if args.listen or args.zenoh_config else [DEFAULT_ENDPOINT])
-    zenoh = connect is not None and importlib.util.find_spec("zenoh") is not None  # a finding where it is missing
+    zenoh = connect is not None and importlib.util.find_spec("zenoh") is not None  # a finding if it is missing
     if connect is not None and zenoh:
-        compose(connect, args.listen, args.zenoh_config)  # mistakes before anything slow
-    # the robot may stop before the other checks, which take seconds, are done
+        compose(connect, args.listen, args.zenoh_config)  # reports mistakes before anything slow
+    # listen first: the robot may stop during the other checks, which take seconds
     heard = (yield from _listen(args, connect, keys)) if connect is not None and zenoh else None
     yield from machine_findings()
     sha256 = base_map = None
@@ -137,14 +137,14 @@ def _findings(args: argparse.Namespace, keys: list[RobotKeys]) -> Iterator[Findi
 def _listen(
     args: argparse.Namespace, connect: list[str], keys: list[RobotKeys]
 ) -> Generator[Finding, None, Heard | None]:
-    """Yield the finding about the connection, and return what came; None without one."""
+    """Yield the finding on the connection, and return the messages heard; None without a connection."""
     from coview_stream.doctor.finding import from_error
     from coview_stream.doctor.network_checks import connection_finding, listen
     from coview_stream.stream.transport.zenoh_transport import open_transport
 
     logger = logging.getLogger("coview_stream.stream")
     before = logger.level
-    logger.setLevel(logging.CRITICAL)  # what the transport would log is a finding here
+    logger.setLevel(logging.CRITICAL)  # errors that the transport would log are findings here
     try:
         transport = open_transport(connect, args.listen, args.zenoh_config)
     except TransportError as error:

@@ -29,7 +29,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    """Print the evaluation; exit code 0 for a bad trajectory, too: the comparison is done."""
+    """Print the evaluation; exit code 0 for a bad trajectory too: the comparison is done."""
     from coview_stream.clouds.trajectory import read_tum
     from coview_stream.report.evaluation import constant_offset, evaluate, frame_errors
 
@@ -52,7 +52,7 @@ def run(args: argparse.Namespace) -> int:
 
 
 def table(evaluation: Evaluation) -> str:
-    """Return the evaluation as lines of a name and its value."""
+    """Return the evaluation as lines of names and values."""
     first = "never" if evaluation.first_fix_m is None else f"after {evaluation.first_fix_m:.1f} m"
     rows = [
         ("success", "yes" if evaluation.success else "no"),

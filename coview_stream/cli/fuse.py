@@ -34,7 +34,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    """Write the cloud, the names of its sources and the picture; print what was added."""
+    """Write the cloud, the names of its sources and the picture; print a summary."""
     from coview_stream.basemap.basemap import BaseMap
     from coview_stream.clouds.progress import progress_bar
     from coview_stream.config.mount import Mount

@@ -1,4 +1,4 @@
-"""``coview-stream help``: the help of a command, or a page of the documentation, which a wheel has as well."""
+"""``coview-stream help``: the help of a command, or a page of the documentation, which the wheel contains."""
 
 from __future__ import annotations
 
@@ -17,13 +17,13 @@ _PACKAGE = Path(__file__).resolve().parents[1]
 
 
 def pages() -> dict[str, Path]:
-    """Return the pages by name: of an installed wheel from the package, of a checkout from docs/."""
+    """Return the pages by name: from the package in an installed wheel, from docs/ in a checkout."""
     found = sorted((_PACKAGE / "docs").glob("*.md")) or sorted((_PACKAGE.parent / "docs").glob("*.md"))
     return {path.stem: path for path in found}
 
 
 class _Suggested(list[str]):
-    """Names that the shell completes; :func:`run` judges what was given."""
+    """Names that the shell completes; :func:`run` checks the given name."""
 
     def __init__(self, known: Iterable[str]) -> None:
         from coview_stream.cli import COMMANDS
@@ -41,7 +41,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    """Print it."""
+    """Print the help or page."""
     from coview_stream.cli import COMMANDS, PROGRAM, main
 
     known, topic = pages(), args.topic
@@ -64,7 +64,7 @@ def run(args: argparse.Namespace) -> int:
 
 
 def readable(page: str) -> str:
-    """Return a page for a terminal: links by their names, a table's rows as paragraphs, a line for each cell."""
+    """Return a page for a terminal: links as their text, table rows as paragraphs with one line per cell."""
     lines, names = list[str](), list[str]()
     for line in re.sub(r"!?\[([^\]]*)\]\((?!http)[^)\s]*\)", r"\1", page).splitlines():
         cells = [cell.strip().replace("\\|", "|") for cell in re.split(r"(?<!\\)\|", line)[1:-1]]
@@ -81,7 +81,7 @@ def readable(page: str) -> str:
 
 
 def page_titled(word: str) -> str | None:
-    """Return the first page with a word in a title, whose blanks do not count: ros2 is ROS 2; None if none has it."""
+    """Return the first page with a word in a title, ignoring blanks (ros2 is ROS 2); None if there is none."""
     for name, path in pages().items():
         titles = [line for line in path.read_text(encoding="utf-8").splitlines() if line.startswith("#")]
         if any(word.casefold() in "".join(title.split()).casefold() for title in titles):

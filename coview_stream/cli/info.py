@@ -80,7 +80,7 @@ def run(args: argparse.Namespace) -> int:
 
 
 def _ambiguity(base_map: BaseMap, acceptance: AcceptanceConfig, args: argparse.Namespace) -> object:
-    """Return the map's ambiguity, numbers for JSON or a sentence; draw it if a picture is asked for."""
+    """Return the map's ambiguity, numbers for JSON or a sentence; draw it on request."""
     from coview_stream.clouds.progress import progress_bar
     from coview_stream.config import LocalizerConfig
     from coview_stream.localization.search.ambiguity import ambiguity
@@ -124,7 +124,7 @@ def describe(base_map: BaseMap) -> dict[str, object]:
 
 
 def _site(directory: Path) -> dict[str, object]:
-    """Describe the directory that a map's tiles are in."""
+    """Describe the directory that holds a map's tiles."""
     from coview_stream.basemap.site.manifest import Manifest
 
     site = Manifest.load(directory)

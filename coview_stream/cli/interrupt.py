@@ -1,4 +1,4 @@
-"""Ctrl-C: a command ends with 130, also where a library drops the exception or turns it into another one."""
+"""Ctrl-C: a command ends with 130, even if a library drops the exception or turns it into another one."""
 
 from __future__ import annotations
 
@@ -12,15 +12,15 @@ from collections.abc import Iterator
 from importlib.machinery import ExtensionFileLoader
 from types import FrameType
 
-_AGAIN = 0.5  # seconds until an interrupt that went nowhere is raised once more
-_SOON = 0.02  # seconds until the import of a native module is looked at again
+_AGAIN = 0.5  # seconds until an interrupt without effect is raised again
+_SOON = 0.02  # seconds until the import of a native module is checked again
 
 
 class Interrupt:
     """Handler of SIGINT, which raises KeyboardInterrupt until the block of :func:`interruptible` ends.
 
-    One exception is not enough: ``__del__`` and callbacks drop it, and a native module whose import it breaks off makes
-    an ImportError of it, as if the module were not installed.
+    One exception is not enough: ``__del__`` and callbacks drop it, and a native module whose import it aborts turns it
+    into an ImportError, as if the module were not installed.
 
     Attributes:
         seen: whether SIGINT has come.
@@ -30,7 +30,7 @@ class Interrupt:
         self.seen = False
 
     def __call__(self, number: int, frame: FrameType | None) -> None:
-        """Raise, after the import of a native module; at the alarms that follow, if the exception is not on its way."""
+        """Raise, but after the import of a native module; at later alarms only if the exception is not on its way."""
         self.seen = True
         importing = _imports_native(frame)
         signal.setitimer(signal.ITIMER_REAL, _SOON if importing else _AGAIN, _AGAIN)
@@ -38,12 +38,12 @@ class Interrupt:
             raise KeyboardInterrupt
 
     def unraisable(self, args: sys.UnraisableHookArgs, /) -> None:
-        """Report an exception that could not be raised, but no KeyboardInterrupt: it is raised again."""
+        """Report an exception that could not be raised, except KeyboardInterrupt, which is raised again."""
         if not issubclass(args.exc_type, KeyboardInterrupt):
             sys.__unraisablehook__(args)
 
     def leave(self) -> None:
-        """End the process without the interpreter's teardown, which crashes beside threads that compute."""
+        """End the process without interpreter teardown, which crashes while threads compute."""
         if self.seen:
             with contextlib.suppress(OSError, ValueError):
                 sys.stdout.flush()
@@ -53,9 +53,9 @@ class Interrupt:
 
 @contextlib.contextmanager
 def interruptible(whole_process: bool) -> Iterator[Interrupt]:
-    """Handle SIGINT in the block; where it is ignored or the program's own, and on other threads, leave it.
+    """Handle SIGINT in the block; leave it alone on other threads, and where it is ignored or has another handler.
 
-    With ``whole_process`` this is the command's process: after the block nothing is left that SIGINT should not end.
+    With ``whole_process`` this is the command's process: after the block SIGINT may end everything.
     """
     interrupt = Interrupt()
     possible = hasattr(signal, "SIGALRM") and threading.current_thread() is threading.main_thread()
@@ -77,7 +77,7 @@ def interruptible(whole_process: bool) -> Iterator[Interrupt]:
 
 
 def _unwinding() -> bool:
-    """Return whether the interrupted code is a cleanup that a KeyboardInterrupt has begun."""
+    """Whether the interrupted code is cleanup after a KeyboardInterrupt."""
     error = sys.exception()
     while error is not None and not isinstance(error, KeyboardInterrupt):
         error = error.__context__
@@ -85,7 +85,7 @@ def _unwinding() -> bool:
 
 
 def _imports_native(frame: FrameType | None) -> bool:
-    """Return whether the interrupted code is run by a native module that is being imported."""
+    """Whether a native module that is being imported runs the interrupted code."""
     while frame is not None:
         if isinstance(frame.f_locals.get("self"), ExtensionFileLoader):
             return True

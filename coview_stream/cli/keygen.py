@@ -1,4 +1,4 @@
-"""``coview-stream keygen``: a pair of keys to sign maps with, and to verify them by."""
+"""``coview-stream keygen``: a pair of keys that sign and verify maps."""
 
 from __future__ import annotations
 

@@ -39,7 +39,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    """Localize and write; exit code 1 if no frame could be localized."""
+    """Localize and write; exit code 1 if no frame was localized."""
     from coview_stream.basemap.basemap import BaseMap
     from coview_stream.clouds.progress import progress_bar
     from coview_stream.config import LocalizerConfig
@@ -66,7 +66,7 @@ def run(args: argparse.Namespace) -> int:
     asked = _doctor_command(args)
     open_map_argument(args)
     base_map = BaseMap.load(args.map, verify_key=args.verify_key)
-    geo = reference_for(base_map.crs, formats)  # before anything slow: there may be none
+    geo = reference_for(base_map.crs, formats)  # before anything slow: the map may have none
     missing = base_map.require_features(args.reloc)
     if missing is not None:
         print(f"{args.map}: {missing}", file=sys.stderr)
@@ -99,16 +99,16 @@ def run(args: argparse.Namespace) -> int:
 
 
 def _doctor_command(args: argparse.Namespace) -> str:
-    """Return the command of a shell that judges the same data; ``args`` name the map as it was given."""
+    """Return the shell command that diagnoses the same data; ``args`` name the map as the user gave it."""
     words = ["coview-stream", "doctor", str(args.map), "--run", str(args.run_path)]
     for name in ("around", "odometry", "mount", "cloud_delay", "cloud_topic", "odometry_topic"):
         value = getattr(args, name)
-        words += [] if value in (None, "auto") else [f"--{name.replace('_', '-')}={value}"]  # it may begin with a minus
+        words += [] if value in (None, "auto") else [f"--{name.replace('_', '-')}={value}"]  # may begin with a minus
     return shlex.join(words)
 
 
 def _can_draw() -> bool:
-    """Return whether pictures can be drawn; if not, print why: poses are what matters."""
+    """Whether pictures can be drawn; if not, print why and go on: poses matter most."""
     from coview_stream.errors import DependencyError, require_library
 
     try:

@@ -1,4 +1,4 @@
-"""The map that a command works on: a file, a site's directory, or the address of a site, of which a copy is kept."""
+"""The map that a command works on: a file, a site's directory, or the address of a site, which is cached."""
 
 from __future__ import annotations
 
@@ -15,19 +15,14 @@ if TYPE_CHECKING:
 
 
 class LocalMap(NamedTuple):
-    """A map on this machine.
-
-    Attributes:
-        path: argument of :meth:`BaseMap.load`.
-        mirrors: of the sites elsewhere that it is made of; none of a map that is here.
-    """
+    """A map on this machine: the argument of :meth:`BaseMap.load`, and mirrors of the remote sites that form it."""
 
     path: Path
     mirrors: tuple[Mirror, ...] = ()
 
 
 def add_map(parser: argparse.ArgumentParser, optional: bool = False, several: bool = False) -> None:
-    """Declare the map's argument, and ``--around``; ``several``: or more than one."""
+    """Declare the map argument and ``--around``; ``several``: the command accepts more than one map."""
     parser.add_argument(
         "map",
         nargs="*" if several else "?" if optional else None,
@@ -41,7 +36,7 @@ def add_map(parser: argparse.ArgumentParser, optional: bool = False, several: bo
 
 
 def check_map_name(output: str, directory: bool) -> None:
-    """Refuse a name that says another format than the one that is written (ConfigError): a file is ``NAME.coview``."""
+    """Refuse a name of another format than the one written (ConfigError): a file is ``NAME.coview``."""
     from coview_stream.clouds.files import is_cloud_name
 
     path = Path(output)
@@ -55,7 +50,7 @@ def check_map_name(output: str, directory: bool) -> None:
 
 
 def refuse_run(path: Path) -> None:
-    """Refuse a run in the place of a map (MapError): arguments change places easily."""
+    """Refuse a run in place of a map (MapError): the two arguments are easily swapped."""
     if path.suffix == ".coview" or (path / "manifest.json").exists():
         return
     from coview_stream.recordings.layouts import is_run
@@ -72,9 +67,9 @@ def local_map(
     connect: Sequence[str] = (),
     config: Path | None = None,
 ) -> LocalMap:
-    """Return the map that a command was given, by path or address; a site elsewhere is fetched and checked.
+    """Return the map that a command was given, by path or address; a remote site is fetched and checked.
 
-    ``around`` is ``X,Y,RADIUS``, None for all of it; ``verify_key`` must have signed a site elsewhere. ``base``,
+    ``around`` is ``X,Y,RADIUS``, None for all of it; ``verify_key`` must have signed a remote site. ``base``,
     ``connect`` and ``config`` are the zenoh key, endpoints and configuration for ``zenoh://SITE``.
 
     Raises:
@@ -85,7 +80,7 @@ def local_map(
         if not Path(name).exists():
             raise MapError(f"{name}: cannot read the map (No such file or directory); check the path")
         refuse_run(Path(name))
-        return LocalMap(Path(name))  # without the modules below: most maps are files
+        return LocalMap(Path(name))  # skips the imports below: most maps are files
 
     from coview_stream.basemap.site.fetch import is_site_address
     from coview_stream.basemap.site.manifest import Manifest, is_site
@@ -109,10 +104,10 @@ def local_map(
 
 
 def open_map_argument(args: argparse.Namespace) -> LocalMap:
-    """Return the map that parsed arguments name, and put its path in the place of ``args.map``.
+    """Return the map that parsed arguments name, and replace ``args.map`` by its path.
 
     Raises:
-        As of :func:`local_map`; InputError: the key cannot be read.
+        As :func:`local_map`; InputError: the key cannot be read.
     """
     from coview_stream.basemap.signature import read_verify_key
 

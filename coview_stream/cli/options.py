@@ -1,4 +1,4 @@
-"""Options that several commands share, and what they mean: runs, search, network, odometry, kept state."""
+"""Options that several commands share, and their meaning: runs, search, network, odometry, kept state."""
 
 from __future__ import annotations
 
@@ -21,11 +21,11 @@ if TYPE_CHECKING:
     from coview_stream.localization.search.hints import PlaceGuess
 
 _SHORT = {"dead_reckoning_timeout": "coast"}
-"""Options that are called otherwise than their field."""
+"""Options whose names differ from their fields'."""
 
 
 def documented_fields(kind: type[Any]) -> dict[str, str]:
-    """Return the text of each field in the docstring of a configuration."""
+    """Return the text of each field in a configuration's docstring."""
     _, _, attributes = (inspect.getdoc(kind) or "").partition("\nAttributes:\n")
     attributes = re.split(r"^\S", attributes, maxsplit=1, flags=re.MULTILINE)[0]
     field = re.compile(r"^    (\w+): (.*?)(?=^    \w+: |\Z)", re.MULTILINE | re.DOTALL)
@@ -38,16 +38,16 @@ def role_free(text: str) -> str:
 
 
 class HelpAll(argparse.Action):
-    """Print the help with the rare options, and end."""
+    """Print the help with the rare options, and exit."""
 
     def __call__(self, parser: argparse.ArgumentParser, *_: Any) -> NoReturn:
-        """Print and end."""
+        """Print the help and exit."""
         print(parser.format_help(everything=True), end="")  # type: ignore[call-arg]  # the command's own parser
         parser.exit()
 
 
 def hide_rare(parser: argparse.ArgumentParser, *names: str) -> None:
-    """Leave options out of ``--help`` by their destinations, and declare ``--help-all``."""
+    """Hide options from ``--help``, given their destinations, and declare ``--help-all``."""
     for action in parser._actions:
         if action.dest in names:
             action.rare = True  # type: ignore[attr-defined]  # read by the command's parser
@@ -55,7 +55,7 @@ def hide_rare(parser: argparse.ArgumentParser, *names: str) -> None:
 
 
 def add_fields(group: argparse._ActionsContainer, kind: type[Any], units: Mapping[str, str]) -> None:
-    """Declare fields of a configuration as options, with its documentation and defaults; None where not given."""
+    """Declare configuration fields as options, with their documentation and defaults; None if not given."""
     defaults, texts = kind(), documented_fields(kind)
     for name, unit in units.items():
         default = getattr(defaults, name)
@@ -69,13 +69,13 @@ def fill_from_settings(
     args: argparse.Namespace, settings: Mapping[str, Any], path: Path | str, parser: argparse.ArgumentParser,
     tables: Collection[str],
 ) -> dict[str, dict[str, Any]]:  # fmt: skip
-    """Set the options that were not given to those of some settings, by their names, and return their tables.
+    """Set the options that were not given from some settings, by name, and return the settings' tables.
 
-    ``args.in_file`` gets the options in the file, ``args.from_file`` those of them that it decides, by all their names.
+    ``args.in_file`` gets the options in the settings, ``args.from_file`` those that they decide, with all their names.
     ``path`` names the settings in errors.
 
     Raises:
-        ConfigError: an unknown key, or a value that the option does not take.
+        ConfigError: an unknown key, or a value that the option does not accept.
     """
     from coview_stream.config.settings_file import unknown_key
 
@@ -90,7 +90,7 @@ def fill_from_settings(
         value = getattr(args, action.dest)
         if not (value is None or value is False or value == []):  # 0 is a value
             given.add(action)
-    for group in parser._mutually_exclusive_groups:  # one of them on the command line: the file's others are replaced
+    for group in parser._mutually_exclusive_groups:  # one of a group on the command line replaces the file's others
         if given.intersection(group._group_actions):
             given.update(group._group_actions)
     file_tables: dict[str, dict[str, Any]] = {}
@@ -114,7 +114,7 @@ def fill_from_settings(
 
 @contextlib.contextmanager
 def blaming_file(args: argparse.Namespace) -> Iterator[None]:
-    """Have an error about an option that ``--config`` has set name the file and the key, not the option."""
+    """Make an error about an option that ``--config`` has set name the file and the key."""
     try:
         yield
     except CoViewError as error:
@@ -127,7 +127,7 @@ def blaming_file(args: argparse.Namespace) -> Iterator[None]:
 
 
 def _value_of(action: argparse.Action, value: Any, where: str) -> Any:
-    """Return a value of a settings file as the command line would give it."""
+    """Return a settings file's value as the command line would give it."""
     if action.nargs == 0 or (action.nargs == "?" and value is True):
         if not isinstance(value, bool):
             raise ConfigError(f"{where} is {value!r}; write true or false")
@@ -151,10 +151,10 @@ def _value_of(action: argparse.Action, value: Any, where: str) -> Any:
 
 
 def host_port(option: str, example: str) -> Callable[[str], str]:
-    """Return the type of an option whose value is ``HOST:PORT``."""
+    """Return the argument type for ``HOST:PORT``."""
 
     def check(text: str) -> str:
-        if not text.rpartition(":")[2].isdecimal():  # the map, say, that follows an option without a value
+        if not text.rpartition(":")[2].isdecimal():  # for example the map after an option without value
             raise argparse.ArgumentTypeError(f"{text!r} is no HOST:PORT; write {option}={example}")
         return text
 
@@ -162,7 +162,7 @@ def host_port(option: str, example: str) -> Callable[[str], str]:
 
 
 ROBOT, KISS_ICP = "robot", "kiss-icp"
-"""Makers of odometry, as ``serve --odometry`` names them."""
+"""Sources of odometry, as ``serve --odometry`` names them."""
 
 
 def _delay(text: str) -> float:
@@ -212,7 +212,7 @@ SHARED: dict[str, dict[str, Any]] = {
         "--gravity=-0.1,0,-9.8 (ground)",
     },
 }
-"""Options that several commands have, in the words of argparse."""
+"""Options that several commands share, as arguments for argparse."""
 
 
 def add_shared(parser: argparse._ActionsContainer, *names: str) -> None:
@@ -222,7 +222,7 @@ def add_shared(parser: argparse._ActionsContainer, *names: str) -> None:
 
 
 def add_network(parser: argparse.ArgumentParser, default: str = "--connect tcp/127.0.0.1:7447") -> None:
-    """Declare ``--connect``, ``--listen``, ``--zenoh-config`` and ``--base``; else ``default``."""
+    """Declare ``--connect``, ``--listen``, ``--zenoh-config`` and ``--base``; without them ``default`` applies."""
     network = parser.add_argument_group(f"network (with none of these: {default})")
     network.add_argument("--connect", action="append", default=[], metavar="EP", help="tcp/HOST:PORT to connect to")
     network.add_argument("--listen", action="append", default=[], metavar="EP", help="endpoint to wait for others on")
@@ -231,7 +231,7 @@ def add_network(parser: argparse.ArgumentParser, default: str = "--connect tcp/1
 
 
 def add_world(parser: argparse.ArgumentParser, size: float, length: float) -> None:
-    """Declare the options of a simulated world that ``demo`` and ``simulate`` share, with their defaults in metres."""
+    """Declare the simulated-world options of ``demo`` and ``simulate``, with their defaults in metres."""
     parser.add_argument(
         "--scene", default="town", help="town, campus, village, industrial, depot (with a hall) or forest (town)"
     )
@@ -247,13 +247,13 @@ def add_world(parser: argparse.ArgumentParser, size: float, length: float) -> No
 
 
 def check_codec(option: str, name: str | None, known: Iterable[str]) -> None:
-    """Refuse an encoding that no codec has (ConfigError); None is always right."""
+    """Refuse an encoding without a codec (ConfigError); None is always valid."""
     if name is not None and name not in known:
         raise ConfigError(f"{option} {name!r} is unknown; choose one of {', '.join(known)}")
 
 
 def add_initial(parser: argparse._ActionsContainer, of_robots: bool = False) -> None:
-    """Declare ``--initial``, a guess of the place; ``of_robots``: one for each, by name."""
+    """Declare ``--initial``, a guess of the place; ``of_robots``: one per robot, by name."""
     parser.add_argument(
         "--initial",
         action="append" if of_robots else "store",
@@ -267,9 +267,9 @@ def add_initial(parser: argparse._ActionsContainer, of_robots: bool = False) -> 
 
 
 def initial_guess(text: str | None, within: float | None = None) -> PlaceGuess | None:
-    """Return the guess that ``X,Y[,YAW]`` means, metres and degrees; of several maps, ``MAP:X,Y[,YAW]``; None for none.
+    """Return the guess in ``X,Y[,YAW]``, metres and degrees; with several maps ``MAP:X,Y[,YAW]``; None for None.
 
-    ConfigError for another text, and for ``within`` alone or that is no distance.
+    ConfigError for other texts, and for ``within`` alone or out of range.
     """
     from coview_stream.geometry.validation import MAX_COORDINATE
     from coview_stream.localization.search.hints import MIN_WITHIN, PlaceGuess
@@ -295,7 +295,7 @@ def initial_guess(text: str | None, within: float | None = None) -> PlaceGuess |
 
 
 def initial_guesses(texts: Iterable[str], robots: Iterable[str], within: float | None = None) -> dict[str, PlaceGuess]:
-    """Return the guesses of ``NAME=X,Y[,YAW]`` by robot; ConfigError for no guess, or an unknown robot."""
+    """Return the guesses in ``NAME=X,Y[,YAW]`` by robot; ConfigError for a bad guess or an unknown robot."""
     out: dict[str, PlaceGuess] = {}
     known = list(robots)
     if not (texts := list(texts)):
@@ -313,7 +313,7 @@ def initial_guesses(texts: Iterable[str], robots: Iterable[str], within: float |
 
 
 def acceptance_config(risk: str | float) -> AcceptanceConfig:
-    """Return the limits of a fix by ``--risk``; ConfigError if it is no number from 1e-6 to below a half."""
+    """Return the limits of a fix for ``--risk``; ConfigError if it is not a number from 1e-6 to below a half."""
     from coview_stream.config.localizer import LEAST_RISK, AcceptanceConfig
 
     try:
@@ -326,7 +326,7 @@ def acceptance_config(risk: str | float) -> AcceptanceConfig:
 
 
 def check_picture(option: str, path: Path | None) -> None:
-    """Refuse a picture that is a directory, or in one that is not there (ConfigError); None is always right."""
+    """Refuse a picture that is a directory, or in a missing one (ConfigError); None is always valid."""
     if path is None:
         return
     if path.is_dir():
@@ -336,7 +336,7 @@ def check_picture(option: str, path: Path | None) -> None:
 
 
 def mount_of(args: argparse.Namespace) -> Mount | None:
-    """Return ``--mount``, None where it is not given; ConfigError if it is not three or six numbers in range."""
+    """Return ``--mount``, None if not given; ConfigError if it is not three or six numbers in range."""
     from coview_stream.config.mount import parse_mount
 
     return None if args.mount is None else parse_mount(args.mount)
@@ -345,10 +345,10 @@ def mount_of(args: argparse.Namespace) -> Mount | None:
 def lidar_config(
     odometry: str, gravity: str | None, max_speed: float = 50.0, delay: float | None = None
 ) -> LidarOdometryConfig | None:
-    """Return how odometry is made of the clouds; None if ``odometry`` is not kiss-icp.
+    """Return how odometry is computed from the clouds; None if ``odometry`` is not kiss-icp.
 
-    ``max_speed`` is the robot's, metres per second. Raises ConfigError where ``gravity`` is no direction, or comes with
-    other odometry, and where ``delay`` comes with this.
+    ``max_speed`` is the robot's, metres per second. ConfigError if ``gravity`` is not a direction or is given with
+    other odometry, or if ``delay`` is given with kiss-icp.
     """
     from coview_stream.config.odometry import LidarOdometryConfig, parse_gravity
 
@@ -374,8 +374,8 @@ def add_state(parser: argparse.ArgumentParser) -> None:
 def state_folder(args: argparse.Namespace) -> Path | None:
     """Return the folder of the last poses after a trial write, and log it; None for nowhere.
 
-    A wrong ``--state`` is refused at the start, not while driving. A default folder that is missing or cannot be
-    written is logged only: a service without a home has to run, and a disk may be mounted later.
+    A wrong ``--state`` is refused at the start, not while driving. A default folder that is missing or not writable is
+    only logged: a service without a home must run, and a disk may be mounted later.
 
     Raises:
         InputError: ``--state`` names a directory that cannot be written. ConfigError: it is empty.

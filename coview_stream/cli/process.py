@@ -1,4 +1,4 @@
-"""Process of a command that runs for long: its log, and the signals that ask it to end."""
+"""Process of a long-running command: its log, and the signals that ask it to end."""
 
 from __future__ import annotations
 
@@ -16,13 +16,13 @@ from datetime import UTC, datetime
 from coview_stream.errors import printable
 
 _ASKED = b"."
-_ENDING = frozenset((signal.SIGINT, signal.SIGTERM, ord(_ASKED)))  # bytes of the pipe: a signal's number, or ours
+_ENDING = frozenset((signal.SIGINT, signal.SIGTERM, ord(_ASKED)))  # bytes in the pipe: a signal's number, or ours
 
 
 class Stop:
-    """Request to end, set once from a signal handler or any thread; it wakes the thread that waits.
+    """Request to end, set once by a signal handler or any thread; it wakes the waiting thread.
 
-    No :class:`threading.Event`: setting one in a signal handler can deadlock with a wait of the interrupted thread.
+    Not a :class:`threading.Event`, which can deadlock if a signal handler sets it while its thread waits for it.
     Writing a byte to a pipe cannot.
     """
 
@@ -34,29 +34,29 @@ class Stop:
 
     def request(self) -> None:
         """Ask to end; safe in a signal handler."""
-        with contextlib.suppress(OSError):  # full or closed: it has been asked before
+        with contextlib.suppress(OSError):  # full or closed: already asked
             os.write(self._write, _ASKED)
-        # last: a reader of it may close the pipe, whose numbers may be those of another file then
+        # last: a reader may then close the pipe, and its descriptors may come to name another file
         self.requested = True
 
     def now(self) -> float:
-        """Return the steady clock, seconds."""
+        """Return the monotonic clock, seconds."""
         return time.monotonic()
 
     def wait(self, seconds: float) -> bool:
-        """Let ``seconds`` pass; True as soon as the end is requested, False as soon as another signal has come."""
+        """Wait for ``seconds``; True once the end is requested, False once another signal has come."""
         if not self.requested and seconds > 0 and select.select([self._read], [], [], seconds)[0]:
             with contextlib.suppress(OSError):  # another thread has read it
                 if _ENDING.intersection(os.read(self._read, 4096)):
-                    self.request()  # the byte stays for all who wait
+                    self.request()  # keeps a byte in the pipe for all waiters
         return self.requested
 
     @contextlib.contextmanager
     def woken_by_signals(self) -> Iterator[None]:
-        """Have every signal wake the waits, whichever thread the kernel hands it to; the main thread only.
+        """Make every signal wake the waits, whichever thread the kernel delivers it to; on the main thread only.
 
-        A handler written in Python runs on the main thread, which may sleep in a system call while another thread takes
-        the signal; the interpreter writes its number to the pipe at once, on any thread.
+        A Python handler runs on the main thread, which may sleep in a system call while another thread takes the
+        signal; the interpreter writes the signal's number to the pipe at once, on any thread.
         """
         before = signal.set_wakeup_fd(self._write, warn_on_full_buffer=False)
         try:
@@ -72,10 +72,10 @@ class Stop:
 
 @contextlib.contextmanager
 def stop_on_signals(on_hangup: Callable[[], None] | None = None) -> Iterator[Stop]:
-    """Give a :class:`Stop` that SIGINT and SIGTERM request; a second SIGINT interrupts for good.
+    """Yield a :class:`Stop` that SIGINT and SIGTERM request; a second SIGINT interrupts at once.
 
-    Outside the main thread, where Python delivers no signals, it is an ordinary one. ``on_hangup`` is called at SIGHUP,
-    on the main thread; None leaves that signal as it is.
+    Outside the main thread, where Python delivers no signals, only callers can request it. SIGHUP calls ``on_hangup``
+    on the main thread; None leaves that signal alone.
     """
     stop = Stop()
     interrupted = False
@@ -100,7 +100,7 @@ def stop_on_signals(on_hangup: Callable[[], None] | None = None) -> Iterator[Sto
 
 
 class JsonFormatter(logging.Formatter):
-    """One JSON object a record: ``time`` (ISO 8601, UTC), ``level``, ``logger``, ``message``, perhaps ``exception``."""
+    """One JSON object per record: ``time`` (ISO 8601, UTC), ``level``, ``logger``, ``message``, any ``exception``."""
 
     def format(self, record: logging.LogRecord) -> str:
         """Return the record as one line."""
@@ -116,7 +116,7 @@ class JsonFormatter(logging.Formatter):
 
 
 class LineFormatter(logging.Formatter):
-    """One printable line a record, and the lines of its exception; names in it may be anyone's."""
+    """One printable line per record, and the lines of its exception; its names may come from anyone."""
 
     def formatMessage(self, record: logging.LogRecord) -> str:  # logging's name
         """Return the line."""
@@ -124,7 +124,7 @@ class LineFormatter(logging.Formatter):
 
 
 def start_logging(level: int, as_json: bool) -> None:
-    """Log to stderr from ``level`` on."""
+    """Log to stderr from ``level`` upward."""
     handler = logging.StreamHandler()
     handler.setFormatter(JsonFormatter() if as_json else LineFormatter("%(asctime)s %(levelname)s %(message)s"))
     logging.basicConfig(level=level, handlers=[handler])

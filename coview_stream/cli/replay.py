@@ -11,8 +11,8 @@ from coview_stream.cli.options import KISS_ICP, add_network, add_shared, mount_o
 HELP = "feed a recorded run into zenoh as a live robot"
 
 _NO_ODOMETRY = "none"
-_LAST_WAIT = 0.5  # seconds, set by hand: a session learns of subscribers a moment after it first asks
-_STARTS = 120.0  # seconds of an engine's start, at most: EngineProcess; the first one compiles kernels
+_LAST_WAIT = 0.5  # seconds, set by hand: a session learns of subscribers shortly after its first query
+_STARTS = 120.0  # seconds, the longest start of an engine: EngineProcess; the first start compiles kernels
 _MAX_SPACING = 0.4  # seconds, set by hand: 0.1 s of jitter below NodeConfig.odometry_timeout
 
 
@@ -52,7 +52,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    """Wait for a node, send the run, print what was done; exit code 1 if there never was a subscriber."""
+    """Wait for a node, send the run, print a report; exit code 1 if there never was a subscriber."""
     from tqdm import tqdm
 
     from coview_stream.cli.process import stop_on_signals

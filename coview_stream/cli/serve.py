@@ -1,4 +1,4 @@
-"""``coview-stream serve``: the node; lidar frames and odometry in, map-frame poses out, over zenoh."""
+"""``coview-stream serve``: the node; takes lidar frames and odometry, publishes poses in the map frame, over zenoh."""
 
 from __future__ import annotations
 
@@ -60,7 +60,7 @@ _LIMITS = {
 """Fields of NodeConfig that are options, with their units."""
 
 TABLES = ("node", "localizer", "lidar_odometry")
-"""Tables of ``--config``: fields of NodeConfig, LocalizerConfig and LidarOdometryConfig; all other keys are options."""
+"""Tables of ``--config``: fields of NodeConfig, LocalizerConfig and LidarOdometryConfig; other keys are options."""
 
 NOT_IN_TABLES = {"sensor_leans": ("localizer", "odometry decides it"), "mount": ("node", "set it above")}
 """Fields that a table may not set, with the reason."""
@@ -78,22 +78,22 @@ _TWICE = {
     "gravity": ("lidar_odometry", "gravity"),
     **{name: ("node", name) for name in _LIMITS},
 }
-"""Options that are fields of a table as well: a file sets one of the two."""
+"""Options that are also fields of a table: a file sets one of the two."""
 
 _RARE = (
     *("ros_args", "domain", "humble", "cloud_key", "odometry_key", "pose_key", "cloud_encoding", "odometry_encoding"),
     *("pose_encoding", "geo", "gravity", "no_deskew", "reloc", "log_json", "around", "foxglove"),
     *("cloud_delay", "within", "record", "rerun", *_LIMITS),
 )
-"""Options that are left to --help-all."""
+"""Options shown only by --help-all."""
 
 _PARAMETERS = "ROS parameters"
 
 _TOPICS = ("points", "odom", "pose")
-"""Topics of a robot's clouds, odometry and poses in ROS 2, in its namespace."""
+"""ROS 2 topics of a robot's clouds, odometry and poses, in its namespace."""
 
 _OF_ZENOH = ("preset", "connect", "listen", "zenoh_config", "fleet", "domain", "humble", "pose_encoding", "geo")
-"""Options that say nothing to a ROS 2 node."""
+"""Options without meaning for a ROS 2 node."""
 
 _MAX_SHUTDOWN = 1.5  # seconds after a signal: docs/operate.md promises two
 
@@ -157,16 +157,16 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    """Run until a signal comes; exit code 0 then."""
+    """Run until a signal comes; then exit code 0."""
     from coview_stream.cli.process import start_logging, stop_on_signals
     from coview_stream.cli.view import open_sinks
     from coview_stream.stream.node.engine_process import start_children
     from coview_stream.stream.node.heap import bound_heaps
 
     tables = settings(args)
-    require_installed("scipy", "coview-stream serve")  # before the messages' libraries, which are only a part of [node]
+    require_installed("scipy", "coview-stream serve")  # before the messages' libraries, which are only part of [node]
     bound_heaps(2, map_large=True)
-    # first of all: the engines take longest to start, and nothing that they need is known better later
+    # first: the engines take longest to start, and need nothing that is known later
     children = start_children(args.odometry == KISS_ICP)
     with contextlib.ExitStack() as closing, blaming_file(args):
         for child in children.values():
@@ -180,9 +180,9 @@ def run(args: argparse.Namespace) -> int:
                 views.callback(sink.close)
             with stop_on_signals(lambda: hangups.append(1)) as stop:
                 ended = _serve(options, stop, children, hangups, sinks)
-        if not ended:  # a regular exit would wait for the thread that is stuck in the network
+        if not ended:  # a regular exit would wait for the thread that hangs in the network
             for child in children.values():
-                child.process.kill()  # one that compiles would notice only then
+                child.process.kill()  # a compiling child would notice only later
             logging.shutdown()
             sys.stdout.flush()
             sys.stderr.flush()
@@ -208,7 +208,7 @@ def settings(args: argparse.Namespace) -> dict[str, dict[str, Any]]:
 
         tables |= fill_from_settings(args, read_settings(args.config), args.config, declared, TABLES)
         in_file |= args.in_file
-    if args.ros2 and args.ros_node is None:  # the file says so
+    if args.ros2 and args.ros_node is None:  # the file requests it
         parameters = _ros_parameters(args, declared)
         in_file |= args.in_file
     _merge(tables, parameters)
@@ -233,7 +233,7 @@ def settings(args: argparse.Namespace) -> dict[str, dict[str, Any]]:
 
 
 def _merge(into: dict[str, Any], tables: Mapping[str, Any]) -> None:
-    """Set the fields of nested tables in others."""
+    """Set the fields of nested tables in other tables."""
     for name, value in tables.items():
         if isinstance(value, Mapping) and isinstance(into.get(name), dict):
             _merge(into[name], value)
@@ -242,13 +242,13 @@ def _merge(into: dict[str, Any], tables: Mapping[str, Any]) -> None:
 
 
 def _ros_parameters(args: argparse.Namespace, declared: argparse.ArgumentParser) -> dict[str, dict[str, Any]]:
-    """Start the ROS 2 node that is asked for, set options to its parameters, and return its tables."""
+    """Start the requested ROS 2 node, set options from its parameters, and return its tables."""
     from coview_stream.stream.transport.ros2_node import settings_of, start_node
 
     from_file = args.from_file
     args.ros_node = start_node(args.ros_args or ())
     tables = fill_from_settings(args, settings_of(args.ros_node), _PARAMETERS, declared, TABLES)
-    args.from_file = from_file  # of ``--config``, which errors name
+    args.from_file = from_file  # options from ``--config``, which errors name
     return tables
 
 
@@ -285,7 +285,7 @@ def serve_options(args: argparse.Namespace, tables: dict[str, dict[str, Any]]) -
         mount=mount_of(args) or node.mount,
     )
     localizer = replace(localizer, mount_drawn=localizer.mount_drawn and node.mount.drawn)
-    if "max_gap" not in tables["node"]:  # a pause that keeps the pose up keeps its frames as well
+    if "max_gap" not in tables["node"]:  # a pause that keeps the pose must keep its frames too
         node = replace(node, max_gap=max(node.max_gap, node.odometry_timeout))
     table = {"max_speed": node.max_speed} | tables["lidar_odometry"]
     odometry = with_table(LidarOdometryConfig(), table, f"{source}: [lidar_odometry]")
@@ -301,7 +301,7 @@ def serve_options(args: argparse.Namespace, tables: dict[str, dict[str, Any]]) -
     given: tuple[Any, ...] = (*topics, args.domain, args.humble)
     keys = [robot_keys(args.preset, args.base, robot, *given) for robot in args.robot]
     fleet = None if args.fleet is None else f"{args.base}/fleet/{check_chunk(args.fleet, '--fleet')}"
-    # nodes of a fleet have the same robots
+    # nodes of a fleet have the same robots, so a robot cannot name them
     default_node = args.robot[0] if fleet is None else f"{socket.gethostname()}-{os.getpid()}"
     by_default = not (args.connect or args.listen or args.zenoh_config)
     compose(args.connect or (), args.listen or (), args.zenoh_config)  # mistakes before anything is fetched or written
@@ -327,7 +327,7 @@ def serve_options(args: argparse.Namespace, tables: dict[str, dict[str, Any]]) -
         node_keys=node_keys(args.base, args.node_name or default_node),
         metrics=args.metrics,
     )
-    return replace(options, state=state_folder(args))  # last, for it logs the folder
+    return replace(options, state=state_folder(args))  # last, because it logs the folder
 
 
 def _serve(
@@ -339,7 +339,7 @@ def _serve(
 ) -> bool:
     """Open the node and run it until asked to stop; False if a thread hangs. Each hangup reloads the map.
 
-    A thread of its own opens the node: a signal must end a wait for a host that does not answer, too.
+    Another thread opens the node, so that a signal can end the wait for a host that does not answer.
     """
     from coview_stream.cli.view import feed_of_node
     from coview_stream.stream.node.engine_process import CancelledError
@@ -366,7 +366,7 @@ def _serve(
         pass
     answered = 0
     while not failed:
-        if len(hangups) > answered:  # before the wait, too: one may have come while the node was opened
+        if len(hangups) > answered:  # before the wait too: one may have come while the node opened
             answered = len(hangups)
             for node in opened:
                 node.reload()

@@ -1,4 +1,4 @@
-"""``coview-stream serve-map``: the directories of sites, for nodes that fetch them over zenoh."""
+"""``coview-stream serve-map``: serves directories of sites to nodes that fetch them over zenoh."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    """Serve until a signal comes; exit code 0 then."""
+    """Serve until a signal comes; then exit code 0."""
     import logging
 
     from coview_stream.cli.process import start_logging, stop_on_signals

@@ -11,7 +11,7 @@ from coview_stream.errors import ConfigError, InputError, counted, require_libra
 
 HELP = "simulate a base map and a robot's lidar run through the same place, with the truth"
 
-_UTM = (412_000.0, 5_318_000.0, 240.0)  # metres; an offset such as UTM coordinates have
+_UTM = (412_000.0, 5_318_000.0, 240.0)  # metres; an offset typical of UTM coordinates
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:

@@ -1,6 +1,6 @@
-"""``coview-stream train``: training of the encoders of learned re-localization, on simulated worlds.
+"""``coview-stream train``: train the encoders of learned re-localization on simulated worlds.
 
-Two cores take about an hour, a third of it to simulate, and 2 GB. A training that was interrupted goes on.
+Two cores take about an hour, a third of it for simulation, and 2 GB. An interrupted training continues.
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ HELP = "train the networks of learned re-localization on simulated worlds: an ho
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Declare the command's arguments; the defaults are those of the weights in the package."""
+    """Declare the command's arguments; the defaults are those of the packaged weights."""
     parser.add_argument("out", type=Path, metavar="OUT", help="directory for the weights, card and training data")
     parser.add_argument("--worlds", type=int, metavar="N", help="worlds to train on (62; smoke: 3)")
     parser.add_argument("--first-world", type=int, default=10_000, metavar="SEED", help="first world's seed (10000)")
@@ -30,7 +30,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    """Simulate what is missing, train, write the weights and their card, and print their recall."""
+    """Simulate missing worlds, train, write the weights and their card, and print their recall."""
     from coview_stream.training.train import DEFAULT, SMOKE, train_session
 
     plan = SMOKE if args.smoke else DEFAULT

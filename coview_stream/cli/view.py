@@ -1,4 +1,4 @@
-"""Views of a session that ``serve`` and ``watch`` open: their options, their sinks, and the feed of these."""
+"""Views of a session that ``serve`` and ``watch`` open: their options, sinks and feed."""
 
 from __future__ import annotations
 
@@ -47,7 +47,7 @@ def add_view(parser: argparse._ActionsContainer) -> None:
 
 
 def open_sinks(args: argparse.Namespace) -> list[Sink]:
-    """Open the sinks that the options ask for, and print their addresses."""
+    """Open the requested sinks, and print their addresses."""
     sinks: list[Sink] = []
     mcap, rrd = ([path for path in args.record if path.suffix == suffix] for suffix in (".mcap", ".rrd"))
     for path in args.record:
@@ -81,7 +81,7 @@ def open_sinks(args: argparse.Namespace) -> list[Sink]:
 def feed_of_watch(
     args: argparse.Namespace, transport: Transport, sinks: Sequence[Sink], view: MapView | None, topics: Sequence[Topic]
 ) -> SessionFeed | None:
-    """Return a running feed of the topics that ``watch`` shows; None where nothing takes it in."""
+    """Return a running feed of the topics that ``watch`` shows; None without sinks."""
     if not sinks:
         return None
     from coview_stream.viewers.session_feed import SessionFeed, asked_of_node
@@ -91,7 +91,7 @@ def feed_of_watch(
 
 
 def feed_of_node(node: Node, keys: Sequence[RobotKeys], mount: Mount, sinks: Sequence[Sink]) -> SessionFeed | None:
-    """Return a running feed of a node in this process, on the node's own session; None where nothing takes it in."""
+    """Return a running feed of a node in this process, on the node's own session; None without sinks."""
     if not sinks:
         return None
     from coview_stream.viewers.session_feed import SessionFeed, read_from_files, topics_of_robots

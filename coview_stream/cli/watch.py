@@ -1,4 +1,4 @@
-"""``coview-stream watch``: poses live, as a table, as JSON lines or in a viewer."""
+"""``coview-stream watch``: live poses as a table, as JSON lines or in a viewer."""
 
 from __future__ import annotations
 
@@ -26,12 +26,12 @@ if TYPE_CHECKING:
 
 HELP = "see robots' poses live: a table, JSON lines, or a viewer"
 
-_SILENCE = 3.0  # seconds without a first message after which the keys and endpoints are printed
+_SILENCE = 3.0  # seconds without a first message until the keys and endpoints are printed
 _REDRAW_PERIOD = 0.5  # seconds, on a terminal
 _PRINT_PERIOD = 1.0  # seconds, elsewhere
-_MAX_QUEUED = 10_000  # samples waiting for a slow reader of our output
-_MAX_BYTES = 16_384  # of one of them: statuses have 3,500
-_LINES_APART = 10.0  # seconds between lines about messages that cannot be read
+_MAX_QUEUED = 10_000  # samples that wait for a slow reader of our output
+_MAX_BYTES = 16_384  # of one sample: statuses have 3,500
+_LINES_APART = 10.0  # seconds between lines about unreadable messages
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -46,7 +46,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    """Subscribe and show, until a signal or the time is over."""
+    """Subscribe and show, until a signal or for the given time."""
     from coview_stream.basemap.basemap import BaseMap
     from coview_stream.basemap.summary import MapView
     from coview_stream.cli.process import stop_on_signals
@@ -97,12 +97,12 @@ class _Watch:
         self._terminal = sys.stdout.isatty() and not args.json
         self._lines_drawn = 0  # of the table
         self._unreadable = 0  # messages since the last line about one
-        self._next_line = 0.0  # time of the steady clock
+        self._next_line = 0.0  # time on the monotonic clock
         for topic in topics:
             transport.subscribe(topic.key, functools.partial(self._receive, topic), "all")
 
     def run(self, stop: Stop, end: float | None) -> None:
-        """Show samples until told to stop, or until ``end`` on the steady clock."""
+        """Show samples until told to stop, or until ``end`` on the monotonic clock."""
         period = _REDRAW_PERIOD if self._terminal else _PRINT_PERIOD
         started = time.monotonic()
         redraw, silent_until, heard = started + period, started + _SILENCE, False
@@ -154,7 +154,7 @@ class _Watch:
         if not self._terminal:
             if not self._fleet.views:
                 return
-            for line in self._fleet.table(now, header=not self._lines_drawn):  # the titles once
+            for line in self._fleet.table(now, header=not self._lines_drawn):  # titles once
                 print(line, flush=True)
             self._lines_drawn = 1
             return
@@ -165,7 +165,7 @@ class _Watch:
         self._lines_drawn = len(lines)
 
     def _print_silence(self) -> None:
-        """Print the keys, the connections and the endpoints to which nothing has come."""
+        """Print the keys, connections and endpoints from which nothing has come."""
         from coview_stream.stream.transport.zenoh_transport import DEFAULT_ENDPOINT
 
         connection = self._transport.connection()

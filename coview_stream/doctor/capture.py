@@ -24,16 +24,16 @@ from coview_stream.stream.transport.keys import NodeIdentity, RobotKeys
 from coview_stream.stream.transport.transport import Transport
 
 Wait = Callable[[float], object]
-"""Passes some seconds."""
+"""Waits for some seconds."""
 
 Codecs = tuple[str | None, str | None]
-"""Codecs of all clouds and of all odometry; None: the one that a message names."""
+"""Codecs of all clouds and all odometry; None: the codec that the message names."""
 
-# bounds of the memory
-_MAX_MESSAGES = 20_000  # of a channel: enough for 30 s of the fastest IMU odometry
-_MAX_KEPT = 30_000  # points of a cloud
-_MAX_CLOUDS = 300  # with their points
-_MAX_COORDINATE = 1000.0  # metres: no lidar reaches farther; bytes read in a wrong format are any size
+# limits on memory
+_MAX_MESSAGES = 20_000  # per channel: enough for 30 s of the fastest IMU odometry
+_MAX_KEPT = 30_000  # points kept of a cloud
+_MAX_CLOUDS = 300  # clouds kept with their points
+_MAX_COORDINATE = 1000.0  # metres: no lidar reaches farther; bytes read in a wrong format may have any size
 
 
 @dataclass(frozen=True)
@@ -43,26 +43,26 @@ class CapturedMessage:
     arrived: float  # local time, seconds
     key: str  # key expression of the sample
     encoding: str  # named by the sample; empty without one
-    size: int  # bytes
+    size: int  # size in bytes
     codec: str = ""  # codec that read it; empty if none could
     counter: str = ""  # name of the node's counter for a message that cannot be read
     reason: str = ""  # why it cannot be read
     readable_as: str = ""  # another codec that could read it
-    stamp_ns: int | None = None  # sensor time, None if it cannot be read
+    stamp_ns: int | None = None  # sensor time; None if unreadable
     points: int = 0  # number of finite points
-    distance: float = float("nan")  # median distance of the points, metres, NaN without points
-    # seconds after the stamp of the first and the last point, None without a time per point
+    distance: float = float("nan")  # median distance of the points, metres; NaN without points
+    # first and last point, seconds after the stamp; None without a time per point
     sweep: tuple[float, float] | None = None
-    T_odom_body: Pose | None = None  # (4, 4) odometry, None for clouds
-    cloud: Points | None = None  # (N, 3) float32 sample of the finite points; None past the first clouds
-    doubles: bool = False  # rows of float32 that make sense as float64 alone
+    T_odom_body: Pose | None = None  # (4, 4) odometry; None for clouds
+    cloud: Points | None = None  # (N, 3) float32 sample of the finite points; None after the first clouds
+    doubles: bool = False  # float32 rows that only make sense as float64
 
 
 @dataclass
 class RobotCapture:
     """Messages of one robot between the local times ``began`` and ``ended``, seconds, in order of arrival.
 
-    ``status`` is the newest one, ``servers`` are the nodes that published any, ``alive`` is a node's liveliness token.
+    ``status`` is the newest one, ``servers`` the nodes that published any, ``alive`` a node's liveliness token.
     """
 
     keys: RobotKeys
@@ -73,7 +73,7 @@ class RobotCapture:
     alive: bool = False
     began: float = 0.0
     ended: float = 0.0
-    ended_ns: int = 0  # wall clock, as in the status; 0 where nothing has been captured
+    ended_ns: int = 0  # wall clock, as in the status; 0 if nothing was captured
 
 
 def capture_robots(
@@ -84,7 +84,7 @@ def capture_robots(
     wait: Wait = time.sleep,
     clock: Callable[[], float] = time.monotonic,
 ) -> list[RobotCapture]:
-    """Receive the robots' messages for ``seconds``; ``codecs`` go before the ones that the messages name."""
+    """Receive the robots' messages for ``seconds``; ``codecs`` override the ones that the messages name."""
     prepare(*CLOUD_CODECS, *ODOMETRY_CODECS)
     captures = [RobotCapture(k) for k in keys]
     over = False
@@ -127,12 +127,12 @@ def capture_robots(
 def capture_cloud(
     sample: Sample, arrived: float, option: str | None = None, hint: str | None = None
 ) -> CapturedMessage:
-    """Describe a lidar frame, decoded like in the node."""
+    """Describe a lidar frame, decoded as in the node."""
     captured, message = _capture("cloud", CLOUD_CODECS, decode_cloud, sample, arrived, option, hint)
     if message is None:
         return captured
     finite = message.points[np.isfinite(message.points).all(axis=1)]
-    distances = np.linalg.norm(finite.astype(np.float64), axis=1)  # bytes of another format are any size
+    distances = np.linalg.norm(finite.astype(np.float64), axis=1)  # bytes in another format may have any size
     doubles = captured.codec in ("xyz", "xyzi") and _are_doubles(sample.payload, message.points)
     sweep = None
     if message.times is not None and np.isfinite(message.times).any():
@@ -151,7 +151,7 @@ def capture_cloud(
 def capture_odometry(
     sample: Sample, arrived: float, option: str | None = None, hint: str | None = None
 ) -> CapturedMessage:
-    """Describe an odometry sample, decoded like in the node."""
+    """Describe an odometry sample, decoded as in the node."""
     captured, message = _capture("odometry", ODOMETRY_CODECS, decode_odometry, sample, arrived, option, hint)
     if message is None:
         return captured
@@ -179,7 +179,7 @@ def _capture(
 
 
 def _readable_as(codecs: Mapping[str, Any], decode: Callable[..., Any], sample: Sample) -> str:
-    """Return the name of a codec that reads plausible values; the strictest formats are tried first, raw rows last."""
+    """Return a codec that reads plausible values; the strictest formats are tried first, raw rows last."""
     for name in sorted(codecs, key=lambda name: name in ("xyzi", "xyz")):
         try:
             message = decode(sample, name, None)
@@ -193,16 +193,16 @@ def _readable_as(codecs: Mapping[str, Any], decode: Callable[..., Any], sample: 
 
 
 def _plausible(numbers: npt.NDArray[Any]) -> bool:
-    """Return whether all numbers may be coordinates, metres.
+    """Whether all numbers can be coordinates, metres.
 
-    Denormal numbers and integers read as float32 are next to zero, text and protobuf beyond all lidars.
+    As float32, denormal numbers and integers are next to zero; text and protobuf are beyond any lidar's range.
     """
     size = np.abs(numbers)
     return bool((np.isnan(size) | (size == 0) | ((size > 1e-6) & (size < _MAX_COORDINATE))).all())
 
 
 def _are_doubles(payload: bytes, points: Points) -> bool:
-    """Return whether rows of float32 are of float64: as such alone they may be coordinates."""
+    """Whether float32 rows are really float64: only as float64 can they be coordinates."""
     if len(points) < 2 or len(payload) % 8 or _plausible(points):
         return False
     with np.errstate(invalid="ignore"):

@@ -33,11 +33,11 @@ class Finding:
 
 
 def from_error(what: str, error: Exception | str) -> Finding:
-    """Return a FAIL with an error's message; this package's messages end with the remedy, after a semicolon."""
+    """Return a FAIL with an error's message; this package's messages end with a semicolon and the remedy."""
     found, _, remedy = " ".join(str(error).split()).partition("; ")
     return Finding("FAIL", what, found, remedy)
 
 
 def failed(findings: Iterable[Finding]) -> bool:
-    """Return whether any finding is a FAIL."""
+    """Whether any finding is a FAIL."""
     return any(finding.verdict == "FAIL" for finding in findings)

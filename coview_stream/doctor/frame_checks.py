@@ -1,8 +1,8 @@
 """Checks of clouds against odometry: axes, leans, units, and the motion by both.
 
-The ground is that of :mod:`coview_stream.odometry.gravity`. Where odometry contradicts the lidar, both are read in each
-of the usual wrong ways (:mod:`coview_stream.localization.witness.conventions`, as in the localizer). Readings are
-compared by the probability that odometry follows the lidar's motions; a finding names it.
+The ground comes from :mod:`coview_stream.odometry.gravity`. If odometry contradicts the lidar, both are read in each of
+the usual wrong conventions (:mod:`coview_stream.localization.witness.conventions`, as in the localizer). Readings are
+compared by the probability that odometry follows the lidar's motions; a finding names the best one.
 """
 
 from __future__ import annotations
@@ -46,13 +46,13 @@ from coview_stream.odometry.gravity import ground_plane
 
 # limits between healthy and spoilt runs; set by hand on riverside_a, kitti04, handheld_livox and three simulated runs
 _LEAN = math.radians(6.0)
-_TOO_FAR = math.radians(11.0)  # the localizer corrects leans of about ten degrees by itself
+_TOO_FAR = math.radians(11.0)  # the localizer itself corrects leans of about ten degrees
 _SWAY = math.radians(9.0)
 _MOVING = 1.0  # metres
 
 _MIN_PAIRS = 3
-_FAR = 5.0  # metres from the middle of the way: the middle of a cloud is off by some
-_ABOVE = 1.0  # metres of a lidar above the ground, about
+_FAR = 5.0  # metres from the middle of the path: the middle of a cloud is only approximate
+_ABOVE = 1.0  # metres of a lidar above the ground, approximately
 IN_ODOMETRY = Reading(
     "clouds are in odometry's frame: they were moved there already, as FAST-LIO's /cloud_registered are",
     "send them in the body's frame, as they are seen (/cloud_registered_body)",
@@ -63,7 +63,7 @@ _GROUND_FRAMES = 16
 
 @dataclass(frozen=True)
 class SeenFrame:
-    """Frame of a robot."""
+    """A robot's frame with its odometry."""
 
     stamp: float  # seconds
     points: Points  # (N, 3) body frame, metres
@@ -74,19 +74,19 @@ class SeenFrame:
 class _Ground:
     """Ground below the lidar, over several frames."""
 
-    axis: int  # index into S of the cloud's axis that points up; 0 is z
+    axis: int  # index into AXES of the cloud's axis that points up; 0 is z
     up: Floats  # (3,) mean normal in the cloud's axes
-    up_level: Floats  # (3,) mean normal after odometry has levelled the cloud: (0, 0, 1) without a lean
-    # median angle of the frames' normals from their mean, radians, the smaller of the robot's and odometry's
+    up_level: Floats  # (3,) mean normal after levelling by odometry: (0, 0, 1) without a lean
+    # median angle of the frames' normals from their mean, radians, the smaller of those in level and odometry axes
     sway: float
-    height: float  # of the sensor above it, metres, median
+    height: float  # of the sensor above the ground, metres, median
     lean: float  # angle between the ground's normal and odometry's vertical, radians
 
 
 def frame_findings(
     frames: Sequence[SeenFrame], robot: str | None = None, given: Mount | None = None
 ) -> Iterator[Finding]:
-    """Judge frames in order, a metre or two apart, with their odometry; ``given``: mount that moved their points."""
+    """Judge frames in order, a metre or two apart, with their odometry; ``given``: mount already applied to them."""
     if len(frames) < 2:
         return
     unit = float(np.median([unit_of(frame.points) for frame in frames]))
@@ -120,7 +120,7 @@ def frame_findings(
 
 
 def _ground(frames: Sequence[SeenFrame]) -> _Ground | None:
-    """Return the ground; None if no axis of the clouds has one in half of the frames."""
+    """Return the ground; None if no axis of the clouds shows one in half of the frames."""
     chosen = [frames[k] for k in np.unique(np.linspace(0, len(frames) - 1, _GROUND_FRAMES).astype(int))]
     by_axis = []
     for axis in AXES:
@@ -149,7 +149,7 @@ def _middle(directions: Floats) -> tuple[Floats, float]:
 
 
 def _pairs(frames: Sequence[SeenFrame], ground: _Ground | None) -> tuple[list[Pair], str]:
-    """Return the lidar's motion between frames some metres apart, and the library that is missing for it."""
+    """Return the lidar's motion between frames some metres apart, and any library that is missing for it."""
     if ground is None:
         return [], ""
     try:
@@ -170,9 +170,9 @@ def _explanation(
     unit: float,
     given: Mount | None,
 ) -> Finding | None:
-    """Return the mistake that explains why the lidar contradicts odometry; both where two explain it alike.
+    """Return the mistake that explains why the lidar contradicts odometry; both where two explain it equally well.
 
-    ``unit`` is the metres of the clouds' unit, by which they have been multiplied.
+    ``unit`` is the clouds' unit in metres, which they have been multiplied by.
     """
     candidates: list[tuple[float, Finding]] = []
     sent = seen is not None and ground is not None and not ground.axis and unit == 1.0
@@ -230,14 +230,14 @@ _GUESSED = (
 def _of_fixed_frames(frames: Sequence[SeenFrame]) -> Iterator[tuple[Reading, list[SeenFrame]]]:
     """Yield each fixed frame that the clouds may be in instead of the lidar's, and the clouds moved to the body.
 
-    The middle of the points moves with the robot, which tells about where a map's frame has its origin and x axis.
+    The middle of the points moves with the robot, which shows roughly where a map's frame has its origin and x axis.
     """
     poses = np.array([frame.T_odom_body for frame in frames])
     middles = np.array([np.median(frame.points, axis=0) for frame in frames], dtype=np.float64)
     at, seen = poses[:, :2, 3] @ [1.0, 1.0j], middles[:, :2] @ [1.0, 1.0j]
     turned = np.vdot(at - at.mean(), seen - seen.mean())
     moved = float(np.vdot(at - at.mean(), at - at.mean()).real)
-    # it moves as far as the robot; that of a scan which is repeated does not move
+    # it moves as far as the robot does; the middle of one repeated scan does not move
     if float(np.abs(at - at.mean()).max()) < _FAR or abs(turned) < 0.5 * moved:
         return
     low = float(np.median([np.quantile(frame.points[:, 2], 0.1) for frame in frames]))
@@ -265,7 +265,7 @@ def _mount_finding(axis: int, axes: Reading, R: Floats, robot: str | None, given
 
 
 def _turned_in_place(given: Mount, R: Floats) -> Mount:
-    """Return the mount whose clouds are turned by ``R`` (3, 3) besides; its place is the given one, as in a drawing."""
+    """Return the mount with clouds also turned by ``R`` (3, 3); its position is the given one, as in a drawing."""
     return replace(given.turned(R), x=given.x, y=given.y, z=given.z)
 
 
@@ -306,7 +306,7 @@ def _ground_finding(ground: _Ground, robot: str | None, given: Mount | None) -> 
 
 
 def _surely(seen: Fit) -> str:
-    """Return how probably the verdict of the odds is wrong, in words."""
+    """Return in words how probably the verdict of the odds is wrong."""
     return f"wrong {one_in(1.0 / (1.0 + math.exp(min(abs(seen.odds), 100.0))))}"
 
 

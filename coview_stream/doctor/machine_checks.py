@@ -1,6 +1,6 @@
 """Checks of the machine: Python, processor, memory, and the native libraries.
 
-Each library is tried in a process of its own, because one that crashes or hangs must not end the doctor:
+Each library is tried in its own process, because one that crashes or hangs must not end the doctor:
 ``python -m coview_stream.doctor.machine_checks NAME`` prints one line of JSON.
 """
 
@@ -28,7 +28,7 @@ from coview_stream.errors import PIP_INSTALL, install_command
 
 GB = 1e9
 MIN_MEMORY = 0.6 * GB
-"""Bytes: a node that searches takes 0.36 GB on a small map and 0.47 GB on 1 km2 (``python -m bench memory``)."""
+"""Bytes: a searching node takes 0.36 GB on a small map and 0.47 GB on 1 km2 (``python -m bench memory``)."""
 
 _TIMEOUT = 120.0  # seconds; compiling all kernels takes 3 to 10 on two cores
 _MIN_ZENOH = (1, 10)
@@ -37,18 +37,18 @@ _CODECS = {
     "foxglove_schemas_protobuf.PointCloud_pb2": "foxglove-schemas-protobuf",
     "google.protobuf": "protobuf",
 }
-"""Modules that decode a robot's messages, and the package of each."""
+"""Modules that decode a robot's messages, and their packages."""
 
 _PARTS = {
     "node": (("scipy", "lazrs"), "serve, locate, replay"),
     "build": (("pyproj", "laspy"), "build, simulate, demo"),
     "plot": (("matplotlib",), "pictures"),
 }
-"""Modules of each extra, the first of which tells whether it is installed, and the commands that need it."""
+"""Modules of each extra, the first of which shows whether it is installed, and the commands that need it."""
 
 
 def machine_findings(probed: Callable[[str], dict[str, Any]] | None = None) -> Iterator[Finding]:
-    """Judge the machine; takes some seconds, to compile the kernels. ``probed`` replaces :func:`probe`."""
+    """Judge the machine; takes some seconds to compile the kernels. ``probed`` replaces :func:`probe`."""
     probed = probed or probe
     yield python_finding(sys.version_info[:3])
     cpu = (line.partition(":") for line in _read("/proc/cpuinfo").splitlines())
@@ -78,7 +78,7 @@ def lacking_modules(find: Callable[[str], object] = importlib.util.find_spec) ->
 
 
 def parts_finding(lacking: dict[str, list[str] | None]) -> Finding:
-    """Judge which extras are installed: a robot's side needs none of them."""
+    """Judge which extras are installed: a robot's side needs none."""
     installed = {part: names for part, names in lacking.items() if names is not None}
     text = "; ".join(["client, watch, info, doctor", *(_PARTS[part][1] for part in installed)])
     broken = {part: names for part, names in installed.items() if names}
@@ -99,7 +99,7 @@ def python_finding(version: tuple[int, ...]) -> Finding:
 
 
 def processor_finding(model: str, cores: int, quota: float | None) -> Finding:
-    """Judge the ``cores`` we may run on, of which a container grants ``quota`` at a time (None: all)."""
+    """Judge the ``cores`` available to us, of which a container grants ``quota`` at a time (None: all)."""
     text = f"{model}, {cores} core{'s' if cores != 1 else ''} to use"
     if quota is not None and quota < cores:
         text += f", {quota:g} of them at a time (container limit)"
@@ -109,7 +109,7 @@ def processor_finding(model: str, cores: int, quota: float | None) -> Finding:
 
 
 def memory_finding(total: int | None, available: int | None) -> Finding:
-    """Judge the memory in bytes; None is unknown."""
+    """Judge the memory in bytes; None: unknown."""
     if total is None or available is None:
         return Finding("ok", "memory", "unknown on this system")
     text = f"{available / GB:.1f} GB of {total / GB:.1f} GB available"
@@ -181,7 +181,7 @@ def matplotlib_finding(result: dict[str, Any]) -> Finding:
 
 
 def memory() -> tuple[int | None, int | None]:
-    """Return total and available bytes, within a container's limit; None where the system does not say."""
+    """Return total and available bytes, within a container's limit; None if the system does not report them."""
     numbers = (line.split() for line in _read("/proc/meminfo").splitlines())
     fields = {line[0]: int(line[1]) * 1024 for line in numbers if len(line) > 1 and line[1].isdigit()}
     total, available = fields.get("MemTotal:"), fields.get("MemAvailable:")
@@ -207,7 +207,7 @@ def _read(path: str) -> str:
 
 
 def probe(name: str) -> dict[str, Any]:
-    """Run one of :data:`PROBES` in a process of its own; ``{"error": ...}`` if it fails, crashes or hangs."""
+    """Run one of :data:`PROBES` in its own process; ``{"error": ...}`` if it fails, crashes or hangs."""
     try:
         done = subprocess.run(
             python_command("coview_stream.doctor.machine_checks", name),
@@ -225,7 +225,7 @@ def probe(name: str) -> dict[str, Any]:
 
 
 def read_answer(code: int, out: str, err: str) -> dict[str, Any]:
-    """Return the result that a probe's process printed, or the error that ended it."""
+    """Return the result printed by a probe's process, or the error that ended it."""
     try:
         result = json.loads(out.strip().splitlines()[-1])  # libraries print banners before it
     except (ValueError, IndexError):
@@ -251,7 +251,7 @@ def _probe_kernels() -> dict[str, Any]:
 
 
 def differing(native: Any, twin: Any) -> list[str]:
-    """Return the names of the kernels whose results differ from their twins' on a small cloud."""
+    """Return the kernels whose results differ from their twins' on a small cloud, by name."""
     cloud = np.random.default_rng(0).uniform(-20.0, 20.0, (2000, 3)).astype(np.float32)
     T = np.eye(4)
     T[:3, 3] = 1.0, -2.0, 0.5
@@ -266,7 +266,7 @@ def _close(one: Any, other: Any) -> bool:
     if isinstance(one, tuple):
         return len(one) == len(other) and all(_close(a, b) for a, b in zip(one, other, strict=True))
     a, b = np.asarray(one), np.asarray(other)
-    # the backends add up in different orders: float32 has 7 digits
+    # the backends sum in different orders: float32 has 7 digits
     return a.shape == b.shape and bool(np.allclose(a, b, rtol=1e-5, atol=1e-5))
 
 
@@ -297,7 +297,7 @@ def _probe_codecs() -> dict[str, Any]:
     for module, package in _CODECS.items():
         try:
             importlib.import_module(module)
-        except Exception as error:  # an incompatible protobuf raises an error of its own
+        except Exception as error:  # an incompatible protobuf raises its own exceptions
             missing.append(f"{package} ({type(error).__name__})")
     return {"missing": missing}
 

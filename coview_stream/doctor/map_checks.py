@@ -1,4 +1,4 @@
-"""Checks of a map, and of a recorded run on it: stamps, clouds against odometry, a place, and sensors that lie."""
+"""Checks of a map, and of a recorded run on it: stamps, clouds against odometry, a place, and faulty sensors."""
 
 from __future__ import annotations
 
@@ -26,14 +26,14 @@ if TYPE_CHECKING:
     Judge = Callable[[Frame], tuple[str, str, float] | None]
     Progress = Callable[[int, int], None]
 
-_NETWORK_MEMORY = 0.04 * GB  # of the network and SciPy, in the process that searches
-_INDEX_MEMORY = 1100.0  # bytes per station: 1024 of the index, the rest of a search's results
-_FIELD_MEMORY = 88.0  # bytes per surveyed square metre: 20 a cell, and 8 of the coarse level
-_FEATURE_MEMORY = 20.0  # bytes per square metre: 7 dimensions on cells of 2 m, spectra, a query's scores
+_NETWORK_MEMORY = 0.04 * GB  # for the network and SciPy, in the search process
+_INDEX_MEMORY = 1100.0  # bytes per station: 1024 for the index, the rest for a search's results
+_FIELD_MEMORY = 88.0  # bytes per surveyed square metre: 20 per cell, and 8 for the coarse level
+_FEATURE_MEMORY = 20.0  # bytes per square metre: 7 dimensions on 2 m cells, spectra, scores of a query
 
 
 def open_map(path: Path) -> tuple[BaseMap | None, Finding]:
-    """Open a map, read all of it and compare its checksum; None if it cannot be used."""
+    """Open a map, read all of it and compare its checksum; None if it is unusable."""
     from coview_stream.basemap.basemap import BaseMap
     from coview_stream.basemap.file_format import VERSION
 
@@ -83,20 +83,20 @@ def node_memory(base_map: BaseMap) -> float:
 
 # sizes of the sample
 _FRAMES, _WINDOWS = 80, 4
-_APART = 1.0  # metres between frames, about
-_STANDING_STRIDE = 5  # frames, where odometry does not move
-_MIN_RATE, _MAX_RATE = 0.2, 100.0  # Hz; frames of lidars come 1 to 30 times a second
+_APART = 1.0  # metres between frames, approximately
+_STANDING_STRIDE = 5  # frames, if odometry does not move
+_MIN_RATE, _MAX_RATE = 0.2, 100.0  # Hz; lidars send 1 to 30 frames per second
 _SEARCHED = 60  # frames
 _ENOUGH = 20.0  # metres: most robots are found within ten
-_BETWEEN = 0.21  # seconds, at most, between frames that are watched: odometry in between does not hide accelerations
+_BETWEEN = 0.21  # seconds between watched frames, at most: odometry in between does not hide accelerations
 _WATCHED = 1500  # frames: five minutes
-_MAX_REBUILT = 5_000_000  # points of a map that is built again, in memory: a million takes a core 7 s and 0.2 GB
+_MAX_REBUILT = 5_000_000  # points of a map rebuilt in memory: a million takes a core 7 s and 0.2 GB
 
 
 def run_findings(
     run: Run, base_map: BaseMap | None = None, config: LocalizerConfig | None = None, progress: Progress | None = None
 ) -> Iterator[Finding]:
-    """Judge a run of several frames and, with a map, whether it is localized there; ``progress``: of the frames."""
+    """Judge a run of several frames and, with a map, whether it can be localized; ``progress``: of the frames."""
     config = config or LocalizerConfig()
     if run.mount is not None and not run.mount.drawn:
         config = replace(config, mount_drawn=False)
@@ -120,7 +120,7 @@ def run_findings(
 
 
 def stamps_finding(run: Run) -> Finding:
-    """Judge the time between frames, to find milliseconds or nanoseconds in place of seconds."""
+    """Judge the time between frames, to detect milliseconds or nanoseconds instead of seconds."""
     step = float(np.median(np.diff(run.stamps))) if len(run) > 1 else float("nan")
     found = counted(len(run), "frame") + f", {step:.4g} s from one to the next" * (len(run) > 1)
     for factor, unit in ((1e9, "nanoseconds"), (1e6, "microseconds"), (1e3, "milliseconds")):
@@ -134,11 +134,7 @@ def stamps_finding(run: Run) -> Finding:
 
 
 def seen_frames(run: Run) -> list[SeenFrame]:
-    """Read frames about a metre apart, in a few stretches of a long run, without damaged ones.
-
-    Raises:
-        CloudError: none of them can be read.
-    """
+    """Read undamaged frames about a metre apart, in a few stretches of a long run; CloudError if there are none."""
     steps = np.linalg.norm(np.diff(run.poses[:, :3, 3], axis=0), axis=1)
     step = float(np.median(steps)) if len(steps) else 0.0
     stride = _STANDING_STRIDE if len(run) > 2 * _FRAMES else 1
@@ -163,9 +159,9 @@ def seen_frames(run: Run) -> list[SeenFrame]:
 
 
 def place_finding(run: Run, base_map: BaseMap, config: LocalizerConfig, progress: Progress | None = None) -> Finding:
-    """Search the map for the beginning of the run; FAIL where no place stands out after enough metres.
+    """Search the map for the beginning of the run; FAIL if no place stands out after enough metres.
 
-    A map without a reference system may be in feet: then it is searched once more in metres, unless it is too large.
+    A map without a reference system may be in feet: it is searched again in metres, unless it is too large.
     """
     try:
         from coview_stream.localization.localizer import Localizer
@@ -200,7 +196,7 @@ def place_finding(run: Run, base_map: BaseMap, config: LocalizerConfig, progress
     driven, state, text = searched(base_map)
     if state is State.TRACKING:
         return Finding("ok", "place", f"found {text}")
-    sure = driven >= _ENOUGH and state is State.SEARCHING  # AMBIGUOUS: farther on it may be found
+    sure = driven >= _ENOUGH and state is State.SEARCHING  # AMBIGUOUS: it may be found later
     untried = ""
     if sure and base_map.crs is None and len(base_map.points) > _MAX_REBUILT:
         millions = f"{len(base_map.points) / 1e6:.1f} million points to build again, {_MAX_REBUILT / 1e6:g} at most"
@@ -222,10 +218,7 @@ def place_finding(run: Run, base_map: BaseMap, config: LocalizerConfig, progress
 
 
 def in_feet(base_map: BaseMap, progress: bool = False) -> BaseMap | None:
-    """Return the map that would have been built if its coordinates were feet; None where there would be none.
-
-    ``progress``: show a bar on stderr.
-    """
+    """Return the map as if its coordinates were feet, with a bar on stderr if ``progress``; None if it were empty."""
     from coview_stream.basemap.basemap import BaseMap
 
     try:
@@ -237,17 +230,17 @@ def in_feet(base_map: BaseMap, progress: bool = False) -> BaseMap | None:
 def sensor_findings(
     run: Run, base_map: BaseMap | None, config: LocalizerConfig, progress: Progress | None = None
 ) -> Iterator[Finding]:
-    """Hold clouds, odometry and, with a map, registrations to it against each other over the run.
+    """Compare clouds, odometry and, with a map, registrations over the run.
 
-    Yields the fault that is more probable than none at some frame (poses are withheld long before), of several that of
-    most of the frames that speak for one, and the calibration at the end, both as while tracking.
+    Yields the fault that is more probable than none at some frame (poses are withheld long before), of several the one
+    that most of the accusing frames name; otherwise the calibration at the end. Both are as while tracking.
     """
     try:
         judge, outcome = _judge(base_map, config)
     except ImportError:
-        return  # the motion is not compared either, which has been said
+        return  # the motion is not compared either, which is already reported
     stride = max(1, int(_BETWEEN / max(float(np.median(np.diff(run.stamps))), 1e-6)))
-    stride -= stride % 2 == 0  # two drivers may take turns
+    stride -= stride % 2 == 0  # odd, as two drivers may alternate
     indices = range(0, len(run), stride)[:_WATCHED]
     told = list[tuple[str, str, float]]()
     for done, index in enumerate(indices, start=1):
@@ -293,7 +286,7 @@ def _judge(base_map: BaseMap | None, config: LocalizerConfig) -> tuple[Judge, Ca
                 return None
             return said.cause.value, said.reason, localizer.sensor_fault
 
-        def measured() -> tuple[str, Calibration]:  # places that only led a search tell nothing of map or lean
+        def measured() -> tuple[str, Calibration]:  # places that only led a search say nothing about map or lean
             if localizer.state.has_place:
                 return "clouds, odometry and map", localizer.calibration
             return "clouds and odometry", Calibration()

@@ -38,8 +38,8 @@ _KEYS = (
     "**/@v0/*/pubsub/frame_transform/odometry/**",
 )
 _LISTEN = 2.0  # seconds: clouds come at 5 Hz or more
-_CLOUD = 100  # points at least
-_MAX_LISTED = 3  # candidates in one line
+_CLOUD = 100  # points, at least
+_MAX_LISTED = 3  # candidates per line
 _MAX_CANDIDATES = 200  # a large site has more than anyone reads
 
 
@@ -57,8 +57,8 @@ def discover(
 ) -> list[Candidate]:
     """Return the clouds and odometry on the network, sorted.
 
-    Listens for two seconds to the keys of all robots (all their clouds come here meanwhile), and to any key with the
-    name of a robot or a base among ``names``, whose messages are judged by their content; then asks for tokens.
+    Listens for two seconds to the keys of all robots (and so receives all their clouds), and to any key with the name
+    of a robot or a base among ``names``, whose messages are judged by content; then queries the tokens.
     """
     candidates: set[Candidate] = set()
     seen: set[str] = set()
@@ -89,7 +89,7 @@ def candidates_text(candidates: Iterable[Candidate], channel: str, like: str = "
     """Name the candidates of a channel, with the options that subscribe to them; empty if there are none.
 
     Those spelt most like the silent key ``like`` come first; data of ``served`` robots, which have a node, is named
-    only without any other.
+    only if there is no other.
     """
     others = set(served)
     fitting = [c for c in candidates if c.channel == channel]
@@ -105,10 +105,10 @@ def candidates_text(candidates: Iterable[Candidate], channel: str, like: str = "
 
 
 def from_token(token: str) -> Candidate | None:
-    """Read a publisher's liveliness token; None for any other.
+    """Read a publisher's liveliness token; None for other tokens.
 
-    rmw_zenoh: ``@ros2_lv/<domain>/<zid>/<nid>/<eid>/MP/<enclave>/<ns>/<node>/<topic>/<type>/<hash>/<qos>``, a '/' in
-    names being '%'. The bridge: ``@/<zid>/@ros2_lv/MP/<topic>/<type>/<qos>``, with U+00A7 for '/'.
+    rmw_zenoh: ``@ros2_lv/<domain>/<zid>/<nid>/<eid>/MP/<enclave>/<ns>/<node>/<topic>/<type>/<hash>/<qos>``, with '%'
+    for '/' in names. The bridge: ``@/<zid>/@ros2_lv/MP/<topic>/<type>/<qos>``, with U+00A7 for '/'.
     """
     parts = token.split("/")
     if parts[0] == "@ros2_lv" and len(parts) >= 12 and parts[5] == "MP" and parts[10] in _DDS:
@@ -122,7 +122,7 @@ def from_token(token: str) -> Candidate | None:
 
 
 def from_key(key: str) -> Candidate | None:
-    """Read the key of a sample; None if no preset has such keys."""
+    """Read the key of a sample; None if it fits no preset."""
     parts = key.split("/")
     if len(parts) >= 4 and parts[-2] == "in":
         channel = {"cloud": "cloud", "odom": "odometry"}.get(parts[-1])
@@ -161,7 +161,7 @@ def _named(preset: str, channel: str, key: str, robot: str, base: str) -> Candid
 
 
 def _ros_topic(preset: str, channel: str, topic: str, domain: str = "0", ending: str = "") -> Candidate | None:
-    """Return the candidate of a ROS topic: by the preset where its name is the preset's, else by an explicit key."""
+    """Return the candidate for a ROS topic: by preset if the name is the preset's, else by an explicit key."""
     more = f" --domain {domain}" if domain != "0" else ""
     robot, _, rest = topic.partition("/")
     if rest == {"cloud": "points", "odometry": "odom"}[channel]:
@@ -182,7 +182,7 @@ def _valid(preset: str, channel: str, where: str, options: str, robot: str, base
 
 # seconds
 _CONNECT_TIMEOUT = 2.0  # for a first connection to the given endpoints
-_LISTEN_TIMEOUT = 6.0  # for a first connection from outside: a client tries again every 1 to 4 s
+_LISTEN_TIMEOUT = 6.0  # for a first connection from outside: a client retries every 1 to 4 s
 _POLL_PERIOD = 0.05
 _TCP_TIMEOUT = 1.0
 _OPEN = "is open, but no zenoh session came about"
@@ -190,7 +190,7 @@ _TCP = re.compile(r"(?:tcp|tls|ws)/(\[[^\]]+\]|[^:/]+):(\d+)")
 
 
 def connection_finding(transport: Transport, connect: Sequence[str], wait: Wait = time.sleep) -> Finding:
-    """Judge whether a router or a peer is connected; ``connect`` are the endpoints to name if not."""
+    """Judge whether a router or a peer is connected; ``connect`` are the endpoints to name if none is."""
     waited = 0.0
     connection = transport.connection()
     while not (connection.routers or connection.peers) and waited < (_CONNECT_TIMEOUT if connect else _LISTEN_TIMEOUT):
@@ -236,7 +236,7 @@ def try_tcp(endpoint: str) -> str:
 
 @dataclass(frozen=True)
 class Heard:
-    """What came over the network: the robots' messages, other clouds and odometry, and robots that have a node."""
+    """Result of listening: the robots' messages, other clouds and odometry, and robots that have a node."""
 
     captures: list[RobotCapture]
     candidates: list[Candidate]
@@ -251,7 +251,7 @@ def listen(
     wait: Wait = time.sleep,
     clock: Callable[[], float] = time.monotonic,
 ) -> Heard:
-    """Listen to all robots at once; without any, or if one is silent, look for others."""
+    """Listen to all robots at once; if there are none, or one is silent, look for others."""
     captures = capture_robots(transport, keys, seconds, codecs, wait, clock) if keys else []
     silent = not all(capture.clouds and capture.odometry for capture in captures)
     names = [*(k.robot for k in keys), *{k.alive.partition(f"/{k.robot}/")[0] for k in keys}]
@@ -262,7 +262,7 @@ def listen(
 
 
 def robots_findings(heard: Heard, sha256: str | None = None) -> Iterator[Finding]:
-    """Judge each robot, with the map's ``sha256`` where a map is checked; without any, list those that send."""
+    """Judge each robot, with the map's ``sha256`` if a map is checked; without robots, list those that send."""
     for capture in heard.captures:
         k = capture.keys
         others = heard.served - {k.robot}

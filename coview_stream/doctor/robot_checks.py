@@ -24,19 +24,19 @@ from coview_stream.stream.node.inputs import FrameSync
 from coview_stream.version import __version__
 
 _NODE = NodeConfig()
-# limits of usual robots
-_MIN_CLOUD_RATE, _MAX_CLOUD_RATE = 2.0, 30.0  # Hz; at 2 Hz and 5 m/s there are 2.5 m between frames
+# limits for usual robots
+_MIN_CLOUD_RATE, _MAX_CLOUD_RATE = 2.0, 30.0  # Hz; at 2 Hz and 5 m/s frames are 2.5 m apart
 _MIN_ODOMETRY_RATE = 5.0  # Hz; poses are published at 10 Hz, each with the newest odometry
-_MIN_PER_CLOUD = 0.9  # odometry samples for each cloud, less the difference of the two ways of counting
+_MIN_PER_CLOUD = 0.9  # odometry samples per cloud, less the difference between the two counts
 _MIN_POINTS = 1000
-_MIN_DISTANCE, _MAX_DISTANCE = 0.3, 300.0  # metres; the median of a lidar's ranges lies between, anywhere
+_MIN_DISTANCE, _MAX_DISTANCE = 0.3, 300.0  # metres; the median range of a lidar lies between, anywhere
 _NO_TILT = 1e-9  # radians
 _MAX_SLOPE, _MAX_TILT = math.radians(20), math.radians(45)  # robots climb 20 degrees, hardly 45
-_MAX_CLOCK_RATIO = 1.25  # of stamps to the local clock and its inverse, over a second or more
+_MAX_CLOCK_RATIO = 1.25  # ratio of stamps to the local clock, or its inverse, over a second or more
 
 
 def cloud_findings(capture: RobotCapture, elsewhere: str) -> Iterator[Finding]:
-    """Judge the lidar frames; ``elsewhere`` names other keys with clouds, the remedy if there are none here."""
+    """Judge the lidar frames; ``elsewhere`` names other keys with clouds, as the remedy if there are none here."""
     robot, messages = capture.keys.robot, capture.clouds
     readable = [m for m in messages if m.stamp_ns is not None]
     if not messages:
@@ -96,7 +96,7 @@ def _unreadable(
 
 
 def rate(messages: Sequence[CapturedMessage]) -> float | None:
-    """Return messages per second by their arrival; None for fewer than two."""
+    """Return the arrival rate, messages per second; None for fewer than two."""
     span = messages[-1].arrived - messages[0].arrived if messages else 0.0
     return (len(messages) - 1) / span if span > 0 else None
 
@@ -200,14 +200,14 @@ def gravity_finding(messages: Sequence[CapturedMessage], robot: str) -> Finding:
     return Finding("ok", "gravity", found, robot=robot)
 
 
-_MAX_LAG = 1.0  # seconds of a cloud after the odometry of its stamp; drivers take 0.05 to 0.3
+_MAX_LAG = 1.0  # seconds from the odometry at its stamp to a cloud's arrival; drivers take 0.05 to 0.3
 _YEAR = 3.2e7  # seconds
-_MIN_PAIRED = 0.9  # share of the clouds that find odometry
-_MAX_STATUS_AGE = 5.0  # seconds; a node publishes one every second
+_MIN_PAIRED = 0.9  # share of clouds that find odometry
+_MAX_STATUS_AGE = 5.0  # seconds; a node publishes one per second
 _LEAP_SECONDS = {37: "TAI (of PTP) against UTC", 18: "GPS time against UTC", 19: "TAI against GPS time"}
-_LEAP_TOLERANCE = 0.4  # seconds off a whole number of leap seconds
-_MAX_FRAMES = 60  # compared with odometry
-_NEAREST_NS = 100_000_000  # between a cloud's stamp and its odometry's
+_LEAP_TOLERANCE = 0.4  # seconds from a whole number of leap seconds
+_MAX_FRAMES = 60  # frames compared with odometry
+_NEAREST_NS = 100_000_000  # between the stamps of a cloud and its odometry
 _LONG_SEARCH = 60.0  # seconds: most robots are found within ten
 _DROP_COUNTERS = ("out_of_order", "duplicate", "no_odometry", "late")
 
@@ -244,7 +244,7 @@ def clock_finding(clouds: list[CapturedMessage], odometry: list[CapturedMessage]
 
 
 def _offset(messages: list[CapturedMessage]) -> float:
-    """Return the median of stamp less arrival, seconds."""
+    """Return the median of stamp minus arrival, seconds."""
     first = messages[0].stamp_ns or 0
     return first * 1e-9 + statistics.median(((m.stamp_ns or 0) - first) * 1e-9 - m.arrived for m in messages)
 
@@ -260,7 +260,7 @@ def pairing_finding(
     config, counters = NodeConfig(odometry_history=60.0), Counters()
     buffer = OdometryBuffer(config)
     pairing = FrameSync(config, buffer, counters)
-    # clouds whose odometry came before the capture began or after it ended are not judged
+    # clouds whose odometry came before or after the capture are not judged
     first = min(m.stamp_ns or 0 for m in odometry)
     clouds = [m for m in clouds if (m.stamp_ns or 0) >= first and m.arrived <= ended - config.pairing_wait]
     if not clouds:
@@ -307,7 +307,7 @@ def captured_frames(capture: RobotCapture) -> list[SeenFrame]:
 
 
 def node_finding(capture: RobotCapture, sha256: str | None) -> Finding:
-    """Judge whether a node serves the robot, and its status; ``sha256`` is the expected map's, None for any."""
+    """Judge whether a node serves the robot, and its status; ``sha256`` is the expected map's, None: any map."""
     robot, status = capture.keys.robot, capture.status
     if status is None and not capture.alive:
         return Finding("warn", "node", "none is running", f"`coview-stream serve SITE.coview --robot {robot}`", robot)
@@ -327,7 +327,7 @@ def node_finding(capture: RobotCapture, sha256: str | None) -> Finding:
         return Finding("FAIL", "node", f"{found}, not {sha256[:12]}", "it serves another map: restart it", robot)
     if status.get("version") != __version__:
         return Finding("warn", "node", f"{found}, here {__version__}", "run the same version on both sides", robot)
-    behind = (capture.ended_ns - _number(status, "stamp_ns")) * 1e-9  # judging others takes seconds
+    behind = (capture.ended_ns - _number(status, "stamp_ns")) * 1e-9  # judging other robots takes seconds
     if behind > _MAX_STATUS_AGE:
         return Finding("warn", "node", f"{found}; {_seconds(behind)} old", "its clock, or this one, is wrong", robot)
     errors = status.get("errors")

@@ -1,6 +1,6 @@
-"""Packed rows of point fields, as in PointCloud2 and foxglove.PointCloud, read and written.
+"""Packed rows of point fields, as in PointCloud2 and foxglove.PointCloud: reading and writing.
 
-Lidar drivers add fields for the time and the beam of each point. The type and size of a time decide its meaning:
+Lidar drivers add fields for each point's time and beam. The type and size of a time field decide its meaning:
 
 ================================  =========  ==================================================
 name and driver                   type       meaning
@@ -14,8 +14,8 @@ name and driver                   type       meaning
 ``ring``, ``line``, ``channel``   any        number of the beam; whole floats too
 ================================  =========  ==================================================
 
-Any time name may have any of these types (int32 as uint32). Times farther than 1 s from the stamp, or spanning more
-than 1 s, are dropped: no times are better than wrong ones.
+Any time name may have any of these types (int32 as uint32). Times more than 1 s from the stamp, or spanning more than
+1 s, are dropped: no times are better than wrong ones.
 """
 
 from __future__ import annotations
@@ -46,17 +46,17 @@ Field = tuple[str, str, int]
 
 @dataclass(frozen=True)
 class Table:
-    """Points in a buffer, in rows of fields."""
+    """Points in a buffer, as rows of fields."""
 
     data: memoryview | bytes | npt.NDArray[np.uint8]
     fields: tuple[Field, ...]  # of each point
     step: int  # bytes from one point to the next
     width: int  # points in a row
     height: int = 1  # rows
-    row_step: int = 0  # bytes from one row to the next; not used with one row
+    row_step: int = 0  # bytes from one row to the next; unused for a single row
 
     def column(self, field: Field, count: int = 1) -> npt.NDArray[Any]:
-        """Return (N, count) neighbouring values of every point; a view where strides allow it."""
+        """Return (N, count) adjacent values of every point; a view where strides allow it."""
         _, kind, offset = field
         strides = (self.row_step, self.step, np.dtype(kind).itemsize)
         shape = (self.height, self.width, count)
@@ -65,7 +65,7 @@ class Table:
 
 
 def read_table(table: Table, stamp_ns: int) -> CloudMessage:
-    """Read the cloud in a table; packed float32 x y z stay a view. MessageError if fields and data disagree."""
+    """Read the cloud in a table; packed float32 x y z remain a view. MessageError if fields and data disagree."""
     known = _known_fields(table)
     count = table.width * table.height
     if not count:
@@ -81,7 +81,7 @@ def read_table(table: Table, stamp_ns: int) -> CloudMessage:
     x, y, z = (known[name] for name in "xyz")
     time = next((known[name] for name in TIME_NAMES if name in known), None)
     ring = next((known[name] for name in RING_NAMES if name in known), None)
-    with np.errstate(over="ignore", invalid="ignore"):  # overflow becomes infinity; some NaN signal
+    with np.errstate(over="ignore", invalid="ignore"):  # overflow becomes infinity; signalling NaN
         if table.step == 12 and (x[1:], y[1:], z[1:]) == (("<f4", 0), ("<f4", 4), ("<f4", 8)):
             points = np.ascontiguousarray(table.column(x, 3), dtype=np.float32)
         else:
@@ -108,7 +108,7 @@ def _known_fields(table: Table) -> dict[str, Field]:
 
 
 def write_table(message: CloudMessage) -> Table:
-    """Pack little-endian rows: x y z float32, ``time`` float32 and ``ring`` uint16 where the message has them."""
+    """Pack little-endian rows: x y z float32, and ``time`` float32 and ``ring`` uint16 if the message has them."""
     columns: list[tuple[str, str, npt.NDArray[Any]]]
     columns = [(name, "<f4", message.points[:, axis]) for axis, name in enumerate("xyz")]
     if message.times is not None:
@@ -131,7 +131,7 @@ def _times_from(values: npt.NDArray[Any], points: Points, stamp_ns: int) -> Floa
     if not measured.any():
         return None
     seconds = values.astype(np.float64)
-    if values.dtype.kind in "ui":  # the meanings that the type allows, likeliest first
+    if values.dtype.kind in "ui":  # meanings that the type allows, likeliest first
         meanings = [1e-9 * seconds] if values.dtype.itemsize == 4 else []
     elif values.dtype.itemsize == 4:
         meanings = [seconds]

@@ -1,6 +1,6 @@
 """Raw layouts for senders without a library, such as microcontrollers: little-endian float32 rows.
 
-``xyz`` takes 12 bytes a point; ``xyzi`` takes 16, the fourth number (intensity) is skipped. The stamp is in the
+``xyz`` takes 12 bytes a point, ``xyzi`` 16, of which the fourth number (intensity) is skipped. The stamp is in the
 attachment: :func:`coview_stream.messages.validation.read_attachment`.
 """
 
@@ -20,7 +20,7 @@ _XYZ = (("x", "<f4", 0), ("y", "<f4", 4), ("z", "<f4", 8))
 
 
 def _decode(sample: Sample, columns: int) -> CloudMessage:
-    """Read rows of numbers; the points are a read-only view on the payload."""
+    """Read rows of numbers; the points are a read-only view of the payload."""
     stamp_ns, _ = read_attachment(sample.attachment)
     if stamp_ns is None:
         raise MessageError("no stamp: a raw layout needs an attachment of 8 bytes, int64 little-endian nanoseconds")

@@ -1,6 +1,6 @@
 """ROS 2 messages as CDR with its 4-byte encapsulation header, through rosbags.
 
-Both byte orders are read, little-endian is written. These types have the same layout from Humble to Rolling.
+Reads both byte orders, writes little-endian. These types have the same layout from Humble to Rolling.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ _NUMBERS = {f"<{kind}": number for number, kind in _KINDS.items()}
 
 @lru_cache(maxsize=1)
 def store() -> Any:
-    """Import the message types and generate their code on first use, in about 0.25 s."""
+    """Import the message types and generate their code on first use; takes about 0.25 s."""
     typesys = require_library("rosbags.typesys", "rosbags>=0.11", "ROS 2 messages")
     types = typesys.get_typestore(typesys.Stores.ROS2_HUMBLE)
     for name in (CLOUD, ODOMETRY, POSE):
@@ -40,7 +40,7 @@ def store() -> Any:
 
 
 def _check_encapsulation(payload: bytes, name: str) -> None:
-    """Check the first two bytes, the encoding; the next two are options that a reader ignores."""
+    """Check the first two bytes, the encoding; the next two are options, which a reader ignores."""
     kind = int.from_bytes(payload[:2], "big")
     if len(payload) < 4:
         raise MessageError(f"not a {name} in CDR: truncated")
@@ -55,11 +55,11 @@ def _check_encapsulation(payload: bytes, name: str) -> None:
 
 
 def read(payload: bytes, name: str) -> Any:
-    """Read a message of the type ``name`` in CDR; MessageError if it is none."""
+    """Read a CDR message of type ``name``; MessageError if it is not one."""
     _check_encapsulation(payload, name)
     try:
         return store().deserialize_cdr(memoryview(payload), name)
-    except Exception as error:  # generated code on hostile bytes raises different errors in different versions
+    except Exception as error:  # on hostile bytes generated code raises different errors in different versions
         raise MessageError(f"not a {name} in CDR: {type(error).__name__}: {str(error)[:80]}") from error
 
 
@@ -73,7 +73,7 @@ def _pose(message: Any) -> Pose:
 
 
 def header_stamp(payload: bytes) -> int:
-    """Read the stamp (ns) of the header at the start of a CDR message; MessageError if there is none."""
+    """Read the stamp, nanoseconds, in the header of a CDR message; MessageError without one."""
     return stamp_join(*_unpack("iI", payload, 4))
 
 
@@ -110,7 +110,7 @@ def _refuse_many_fields(payload: bytes) -> None:
 
 
 def decode_cloud(sample: Sample) -> CloudMessage:
-    """Read a PointCloud2 of any layout, or Livox' CustomMsg; packed little-endian float32 x y z stay a view."""
+    """Read a PointCloud2 of any layout, or a Livox CustomMsg; packed little-endian float32 x y z remain a view."""
     if livox.is_custom(sample.payload):
         return livox.decode(sample.payload)
     _refuse_many_fields(sample.payload)
@@ -140,7 +140,7 @@ def new(type_name: str, /, **fields: Any) -> Any:
 
 
 def write(message: Any, name: str) -> Encoded:
-    """Write a message of the type ``name`` in CDR, little-endian."""
+    """Write a message of type ``name`` in CDR, little-endian."""
     payload = bytes(store().serialize_cdr(message, name, little_endian=True))
     return Encoded(payload, f"application/cdr;{name}")
 

@@ -1,4 +1,4 @@
-"""Messages of a localizer to ROS 2 beside its poses, in CDR: transform, diagnostics, points of the map."""
+"""A localizer's ROS 2 messages besides its poses, in CDR: transform, diagnostics, map points."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ _WARN, _STALE = 1, 3
 
 
 def encode_transform(T_parent_child: Pose, stamp_ns: int, parent: str, child: str) -> bytes:
-    """Write one transform (4, 4) as a TFMessage; MessageError for a stamp beyond a header's."""
+    """Write one transform (4, 4) as a TFMessage; MessageError if the stamp is beyond a header's range."""
     x, y, z, *q = pose_to_tum(T_parent_child).tolist()
     transform = new(
         "geometry_msgs/msg/Transform",
@@ -31,7 +31,7 @@ def encode_transform(T_parent_child: Pose, stamp_ns: int, parent: str, child: st
 
 
 def encode_map(points: Points, stamp_ns: int) -> bytes:
-    """Write points (N, 3) of the map as a PointCloud2 in frame ``map``."""
+    """Write map points (N, 3) as a PointCloud2 in frame ``map``."""
     return encode_cloud(CloudMessage(stamp_ns, points), "map").payload
 
 
@@ -39,13 +39,13 @@ def encode_diagnostics(status: Mapping[str, Any], stamp_ns: int, transform: str,
     """Write a robot's status as a DiagnosticArray.
 
     Args:
-        status: the document of ``out/status``.
-        stamp_ns: of the header.
-        transform: how map -> odom stands, for people.
-        clock: how the stamps of the messages contradict this node's clock, for people; empty where they do not.
+        status: document of ``out/status``.
+        stamp_ns: stamp of the header.
+        transform: state of map -> odom, for people.
+        clock: how message stamps contradict this node's clock, for people; empty if they agree.
 
     Raises:
-        MessageError: the document is no status.
+        MessageError: the document is not a status.
     """
     try:
         pose, node = status["pose"], status.get("node", {})

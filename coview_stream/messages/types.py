@@ -29,13 +29,13 @@ from coview_stream.geometry.transforms import (
 class Sample:
     """One message as received from a transport."""
 
-    key: str  # that it was published on
+    key: str  # key it was published on
     payload: bytes
     encoding: str = ""  # MIME type with its schema (``type;schema``), empty if the sender set none
     attachment: bytes | None = None  # sent with the payload
-    size: int | None = None  # bytes of a payload that was too large to receive; ``payload`` is empty then
-    refused: str = ""  # why the transport kept the payload back, for people; likewise
-    mount: Mount | None = None  # of the lidar, where the transport knows it
+    size: int | None = None  # bytes of a payload too large to receive; ``payload`` is then empty
+    refused: str = ""  # why the transport withheld the payload, for people; ``payload`` is then empty
+    mount: Mount | None = None  # of the lidar, if the transport knows it
 
 
 @dataclass(frozen=True)
@@ -54,10 +54,10 @@ class CloudMessage:
     Attributes:
         stamp_ns: sensor time, nanoseconds.
         points: (N, 3) float32 body frame (x forward, z up), metres; may have NaN rows; may be a read-only view.
-        times: (N,) float64 measurement time of each point, seconds after ``stamp_ns`` (negative: before); None if the
-            sender gave none.
-        rings: (N,) beam of each point; None if the sender gave none.
-        sequence: the sender's running number; None if it has none.
+        times: (N,) float64 measurement time of each point, seconds after ``stamp_ns`` (negative: before); None if not
+            sent.
+        rings: (N,) beam of each point; None if not sent.
+        sequence: the sender's sequence number; None without one.
     """
 
     stamp_ns: int
@@ -94,13 +94,13 @@ class PoseMessage:
         state: always ``TRACKING`` from our node.
         T_map_body: (4, 4) float64 map <- body, metres.
         covariance: (6, 6) over (x, y, z, roll, pitch, yaw), map axes, m2 and rad2.
-        confidence: probability, in [0, 1], that the robot is at this place and not elsewhere; NaN where a format has
+        confidence: probability, in [0, 1], that the robot is at this place and not elsewhere; NaN if the format has
             none.
         map_sha256: hash of the base map that the pose refers to.
         age: seconds of sensor time since the last lidar frame that corrected the pose.
         frame_id: name of the map frame, for formats that carry one.
-        protection: metres and degrees that the error exceeds at most once in a thousand; None where a format has none.
-        T_map_odom: (4, 4) map <- odometry, for users of transforms; None where a format has none.
+        protection: metres and degrees that the error exceeds at most once in a thousand; None if the format has none.
+        T_map_odom: (4, 4) map <- odometry, for users of transforms; None if the format has none.
     """
 
     stamp_ns: int
@@ -137,7 +137,7 @@ class PoseMessage:
 
     @property
     def stddev(self) -> Floats:
-        """(6,) one sigma of x, y, z, roll, pitch, yaw, metres and radians; NaN where a format has no covariance."""
+        """(6,) one sigma of x, y, z, roll, pitch, yaw, metres and radians; NaN if the format has no covariance."""
         return stddev_of(self.covariance)
 
     def to_json(self) -> dict[str, Any]:
@@ -174,7 +174,7 @@ class HypothesesMessage:
     places: Floats
     none: float  # probability that the robot is nowhere on the map
     map_sha256: str
-    maps: tuple[str, ...] = ()  # of several maps, the one that each place is on, in whose frame it is; empty of one
+    maps: tuple[str, ...] = ()  # the map of each place, in whose frame it is; empty for a single map
 
 
 @dataclass(frozen=True, eq=False)

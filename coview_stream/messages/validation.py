@@ -1,4 +1,4 @@
-"""Checks of every payload: sizes, stamps, numbers and rotations."""
+"""Checks of payloads: sizes, stamps, numbers and rotations."""
 
 from __future__ import annotations
 
@@ -15,24 +15,24 @@ from coview_stream.geometry.validation import MAX_COORDINATE
 from coview_stream.messages.types import PoseMessage
 
 MAX_PAYLOAD = 64 * 2**20
-"""Bytes of the largest payload that is decoded."""
+"""Largest payload that is decoded, bytes."""
 
 MAX_POINTS = 4_000_000
-"""Points of the largest cloud that is decoded."""
+"""Largest cloud that is decoded, points."""
 
 _NANO = 1_000_000_000
 
 
 class RefusedError(MessageError):
-    """The transport kept a message back, for one of few reasons; counted as malformed."""
+    """The transport withheld a message, for one of a few reasons; counted as malformed."""
 
 
 class OversizedError(MessageError):
-    """A message exceeds the node's limits; counted separately from malformed messages."""
+    """A message exceeds the node's limits; counted separately from malformed ones."""
 
 
 def check_size(payload: bytes, limit: int = MAX_PAYLOAD, size: int | None = None) -> None:
-    """Raise OversizedError for more than ``limit`` bytes, or for ``size`` bytes that a transport left out."""
+    """Raise OversizedError beyond ``limit`` bytes, or for ``size`` bytes that a transport left out."""
     if size is not None or len(payload) > limit:
         size = len(payload) if size is None else size
         raise OversizedError(f"{size} bytes; at most {limit} are taken: send fewer points or fields")
@@ -48,7 +48,7 @@ def stamp_from(value: object) -> int:
 
 
 def stamp_join(seconds: int, nanos: int) -> int:
-    """Join seconds and ``nanos``, in [0, 1e9), to nanoseconds; MessageError if out of range."""
+    """Join seconds and ``nanos``, in [0, 1e9), into nanoseconds; MessageError if out of range."""
     if not 0 <= nanos < _NANO:
         raise MessageError(f"the stamp has {nanos} nanoseconds beside its seconds; they must be below 1e9")
     return stamp_from(seconds * _NANO + nanos)
@@ -60,7 +60,7 @@ def stamp_split(stamp_ns: int) -> tuple[int, int]:
 
 
 def checked_pose(position: Sequence[float], quaternion: Sequence[float]) -> Pose:
-    """Return the pose of x y z (metres) and qx qy qz qw; MessageError if not finite, too far, or no rotation.
+    """Return the pose with x y z (metres) and qx qy qz qw; MessageError if not finite, too far, or not a rotation.
 
     The quaternion is normalised; its norm may be off by 1e-2 (float32 senders).
     """
@@ -73,7 +73,7 @@ def checked_pose(position: Sequence[float], quaternion: Sequence[float]) -> Pose
         raise MessageError(f"the orientation (qx, qy, qz, qw) has norm {norm:.3g}; a rotation has 1")
     x, y, z = position
     a, b, c, w = (part / norm for part in quaternion)
-    # written out: at 16 robots x 100 Hz of odometry, SciPy's 50 us each would take a tenth of a core
+    # explicit: for 16 robots x 100 Hz of odometry, SciPy's 50 us per call would take a tenth of a core
     return np.array(
         (
             (1 - 2 * (b * b + c * c), 2 * (a * b - c * w), 2 * (a * c + b * w), x),
@@ -85,9 +85,9 @@ def checked_pose(position: Sequence[float], quaternion: Sequence[float]) -> Pose
 
 
 def read_attachment(attachment: bytes | None) -> tuple[int | None, int | None]:
-    """Read stamp (ns) and sequence number of a payload; None where absent or not understood.
+    """Read stamp (ns) and sequence number from an attachment; None where absent or unknown.
 
-    8 bytes: int64 LE ns. 33 bytes, rmw_zenoh's: int64 LE number, int64 LE ns, 0x10 and 16 bytes of gid.
+    8 bytes: int64 LE ns. 33 bytes (rmw_zenoh): int64 LE number, int64 LE ns, 0x10 and 16 bytes of gid.
     """
     if attachment is not None and len(attachment) == 8:
         return int.from_bytes(attachment, "little", signed=True), None
@@ -98,7 +98,7 @@ def read_attachment(attachment: bytes | None) -> tuple[int | None, int | None]:
 
 
 def bare_pose(stamp_ns: int, T: Pose, frame_id: str, covariance: Floats | None = None) -> PoseMessage:
-    """Return the message of a format that carries little but a pose; missing fields are NaN or empty."""
+    """Return the message of a format that carries little more than a pose; missing fields are NaN or empty."""
     unknown = np.full((6, 6), np.nan) if covariance is None else covariance
     return PoseMessage(
         stamp_ns,

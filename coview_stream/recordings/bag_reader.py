@@ -1,7 +1,6 @@
-"""ROS recordings, read by rosbags: topics, and messages as CDR in order of arrival.
+"""ROS recordings, read with rosbags: topics, and messages as CDR in order of arrival.
 
-rosbags unpacks whole chunks, and a chunk of a few kB may claim gigabytes. Its decompressors are replaced by bounded
-ones.
+rosbags unpacks whole chunks, and a chunk of a few kB may unpack to gigabytes, so bounded decompressors replace its own.
 """
 
 from __future__ import annotations
@@ -21,12 +20,12 @@ from coview_stream.messages import livox, ros2
 from coview_stream.recordings import frame_tree
 
 LIMIT = 1 << 29
-"""Bytes of an unpacked chunk or message; recorders begin a new chunk after a few MB."""
+"""Largest unpacked chunk or message, bytes; recorders start a new chunk after a few MB."""
 
 RATIO = 100
-"""Times its size, besides :data:`LIMIT`, that a whole file may unpack to; clouds reach less than ten."""
+"""A file may unpack to this multiple of its size, plus :data:`LIMIT`; clouds reach less than ten."""
 
-_REMEDIES = (  # the first whose word occurs in the reason
+_REMEDIES = (  # the first whose key occurs in the reason
     ("ompression", "write it again with zstd or without compression (ros2 bag convert)"),
     ("rofile", "record or export it as ROS 2 (CDR) messages"),
     ("empty", "copy or record it again"),
@@ -38,7 +37,7 @@ _REMEDIES = (  # the first whose word occurs in the reason
 
 @contextmanager
 def readable(name: object, kind: type[InputError] = RunError) -> Iterator[None]:
-    """Turn any error that rosbags raises on a damaged recording into one line that names it and the remedy."""
+    """Turn any error that rosbags raises on a damaged recording into one line with its name and the remedy."""
     try:
         yield
     except CoViewError:
@@ -51,7 +50,7 @@ def readable(name: object, kind: type[InputError] = RunError) -> Iterator[None]:
 
 
 class BagReader:
-    """An open recording, closed when it is garbage-collected; messages are read one by one.
+    """An open recording, closed when it is garbage-collected; messages are read one at a time.
 
     Reads rosbag2 directories (sqlite3 and mcap, several files, compressed or not), single ``.mcap`` and ``.db3`` files,
     and ROS 1 ``.bag`` files, whose messages are converted to CDR.
@@ -75,18 +74,18 @@ class BagReader:
         counts: dict[tuple[str, str], int] = {}
         for connection in self._reader.connections:
             key = (connection.msgtype, connection.topic)
-            if not all(isinstance(name, str) for name in key):  # a database accepts anything
+            if not all(isinstance(name, str) for name in key):  # a database accepts any value
                 raise RunError(f"{self.path}: cannot be read (a topic without name or type); record or copy it again")
             counts[key] = counts.get(key, 0) + connection.msgcount
         return counts
 
     def messages(self, topics: Mapping[str, str], start: int | None = None) -> Iterator[tuple[str, int, bytes]]:
-        """Yield (topic, arrival in ns, CDR) of the topics (name: type), in order of arrival, from ``start`` on.
+        """Yield (topic, arrival in ns, CDR) for the topics (name: type), in order of arrival, from ``start`` on.
 
-        Arrival is on the recorder's clock; it serves only to find a message again.
+        Arrival is on the recorder's clock; it only serves to find a message again.
 
         Raises:
-            Exception: any that rosbags raises; see :func:`readable`.
+            Exception: anything that rosbags raises; see :func:`readable`.
         """
         connections = [c for c in self._reader.connections if topics.get(c.topic) == c.msgtype]
         for connection, arrived, data in self._reader.messages(connections, start=start):
@@ -101,7 +100,7 @@ def _cdr_from_ros1(data: bytes, kind: str) -> bytes:
 
 
 def bounded(make: Callable[[], Any]) -> Callable[..., bytes]:
-    """Return a function that unpacks all frames of its argument, to :data:`LIMIT` bytes at most (else ValueError).
+    """Return a function that unpacks all frames of its argument, at most :data:`LIMIT` bytes (else ValueError).
 
     Args:
         make: returns a decompressor like bz2's: ``decompress(data, max_length)``, ``eof``, ``unused_data``.
@@ -127,7 +126,7 @@ def bounded(make: Callable[[], Any]) -> Callable[..., bytes]:
 
 
 class BoundedFile:
-    """A compressed file, unpacked while it is read, up to a number of bytes; ValueError beyond."""
+    """A compressed file, unpacked as it is read, up to a number of bytes; ValueError beyond."""
 
     def __init__(self, unpacked: Any, left: int) -> None:
         self._unpacked, self._left = unpacked, left
@@ -148,7 +147,7 @@ class BoundedFile:
 
 
 def bounded_open(opener: Callable[..., Any]) -> Callable[..., BoundedFile]:
-    """Return a function that opens a compressed file as ``opener`` does, bounded by :data:`RATIO`."""
+    """Return a function that opens a compressed file like ``opener``, bounded by :data:`RATIO`."""
 
     def opened(file: Any, mode: str = "rb") -> BoundedFile:
         return BoundedFile(opener(file, mode), LIMIT + RATIO * os.fstat(file.fileno()).st_size)
@@ -157,7 +156,7 @@ def bounded_open(opener: Callable[..., Any]) -> Callable[..., BoundedFile]:
 
 
 def _bound_rosbags() -> None:
-    """Replace the decompressors of rosbags' readers, in this process, by bounded ones."""
+    """Replace the decompressors of rosbags' readers, in this process, with bounded ones."""
     from lz4.frame import LZ4FrameDecompressor
     from rosbags.rosbag1 import reader as ros1_reader
     from rosbags.rosbag2 import reader as ros2_reader

@@ -1,8 +1,7 @@
 """Runs from ROS recordings: PointCloud2 or Livox frames, each with the odometry at its stamp.
 
-Odometry is a topic's, or that of ``/tf``; the mount of the lidar is that of ``/tf_static``, unless it is given.
-Messages go through the decoders and the deskewing of the live stream. Clouds are read on demand, and deskewed if their
-points have times.
+Odometry comes from a topic or ``/tf``; the lidar's mount from ``/tf_static``, unless it is given. Messages go through
+the decoders and deskewing of the live stream. Clouds are read on demand, and deskewed if their points have times.
 """
 
 from __future__ import annotations
@@ -34,16 +33,16 @@ from coview_stream.recordings.frame_tree import FrameTree
 from coview_stream.recordings.run import Run
 
 SAME_NS = 1000
-"""Stamps this close are equal: text files and float64 seconds are good to a microsecond."""
+"""Stamps this close are equal: text files and float64 seconds are accurate to a microsecond."""
 
 _NS = 1e-9
 _JUMP_DISTANCE = 1.0  # metres; a shorter step is never a jump
-_MAX_SETBACK_NS = 5_000_000_000  # stamps that go back by less are messages out of order
-_MAX_STRAYS = 0.01  # share of stamps that may go back farther, and are left out
+_MAX_SETBACK_NS = 5_000_000_000  # stamps that go back by less are out of order
+_MAX_STRAYS = 0.01  # share of stamps that may go back farther, and are dropped
 
 
 class Track:
-    """Odometry by stamp, interpolated but not across gaps and jumps, as in the node.
+    """Odometry by stamp, interpolated except across gaps and jumps, as in the node.
 
     Attributes:
         stamps: (K,) nanoseconds, increasing.
@@ -51,7 +50,7 @@ class Track:
     """
 
     def __init__(self, stamps: Ints, poses: Poses) -> None:
-        """Sort the samples, at least one; of equal stamps the first counts."""
+        """Sort the samples, at least one; the first of equal stamps counts."""
         config = NodeConfig()
         self.stamps, first = np.unique(stamps, return_index=True)
         self.poses = poses[first]
@@ -61,7 +60,7 @@ class Track:
         self._part = np.concatenate([[0], np.cumsum(~steady)])
 
     def at(self, stamps: Ints) -> tuple[Poses, Bools]:
-        """Interpolate poses (N, 4, 4) at the stamps (N,); also return where they are known (N,)."""
+        """Interpolate poses (N, 4, 4) at stamps (N,); also return where they are known (N,)."""
         last = len(self.stamps) - 1
         after = np.clip(np.searchsorted(self.stamps, stamps), 0, last)
         before = np.clip(after - 1, 0, last)
@@ -91,7 +90,7 @@ _Topic = tuple[str, str]
 """Type and name."""
 
 OdometryFromClouds = Callable[["BagClouds"], Track]
-"""Makes odometry from the clouds alone, which are not deskewed."""
+"""Computes odometry from the clouds alone, which are not deskewed."""
 
 
 def open_bag(
@@ -104,15 +103,15 @@ def open_bag(
 ) -> Run:
     """Read all stamps and odometry of a recording in one pass, and remember where each cloud is.
 
-    One cloud at a time is in memory; 16 bytes per cloud and 150 per odometry sample stay.
+    One cloud at a time is in memory, plus 16 bytes per cloud and 150 per odometry sample.
 
     Args:
         path: as returned by :func:`~coview_stream.recordings.layouts.find_bag`.
-        explicit: TUM file of the odometry, with any stamps; None takes the recording's.
+        explicit: TUM file with the odometry, at any stamps; None: the recording's.
         cloud_topic: required if several topics have PointCloud2.
         odometry_topic: required if several topics have Odometry; ``/tf`` takes the odometry from there.
-        from_clouds: makes the odometry, even if the recording has some.
-        mount: pose of the lidar; clouds are read into the body frame. None takes it from ``/tf_static``.
+        from_clouds: computes the odometry, even if the recording has some.
+        mount: pose of the lidar; clouds are read into the body frame. None: from ``/tf_static``.
 
     Raises:
         RunError: unreadable; no such topic, or several; or no cloud has odometry at its stamp.
@@ -132,7 +131,7 @@ def open_bag(
         return _pair(reader, clouds, survey, from_clouds(bare), placed)
     if explicit is not None and odometry_topic is not None:
         raise RunError(f"{path}: --odometry {explicit} and --odometry-topic {odometry_topic}; give one of them")
-    # a single scan needs no odometry, as among files
+    # a single scan needs no odometry, as for files
     lone = counts[clouds] == 1 and not any(kind == ros2.ODOMETRY for kind, _ in counts)
     in_topic = any(count and kind == ros2.ODOMETRY for (kind, _), count in counts.items())
     if odometry_topic is not None:
@@ -149,10 +148,7 @@ def open_bag(
 
 
 class BagClouds:
-    """Clouds of a recording by index.
-
-    Read in order, they cost one pass over the recording; in another order, each is found by its arrival.
-    """
+    """Clouds of a recording by index; reading in order takes one pass, otherwise each is found by its arrival."""
 
     def __init__(
         self,
@@ -172,13 +168,13 @@ class BagClouds:
         self._next = -1
 
     def read(self, index: int, correction: SweepCorrection | None = None) -> Cloud:
-        """Read frame ``index`` in the body frame at its stamp, deskewed by odometry as corrected by ``correction``.
+        """Read frame ``index`` in the body frame at its stamp, deskewed by odometry with ``correction`` applied.
 
         Raises:
             CloudError: it is damaged or has no usable point.
         """
         message = self.message(index)
-        # false for NaN as well
+        # false for NaN too
         usable: Bools = np.all(np.abs(message.points) < MAX_COORDINATE, axis=1)
         builder = CloudBuilder(dropped=int((~usable).sum()))
         builder.add(self._deskewed(index, message, usable, correction))
@@ -239,7 +235,7 @@ class _Survey:
     body: str = ""  # child frame id of the odometry
     tree: FrameTree = field(default_factory=FrameTree)
     notes: list[str] = field(default_factory=list)  # for the user
-    source: str = ""  # topic of the tree's static transforms, if it has any
+    source: str = ""  # topic of the tree's static transforms, if there are any
 
 
 def _survey(reader: BagReader, topics: dict[str, str]) -> _Survey:
@@ -268,7 +264,7 @@ def _survey(reader: BagReader, topics: dict[str, str]) -> _Survey:
 
 
 def _choose(path: Path, counts: dict[_Topic, int], kinds: tuple[str, ...], wanted: str | None, option: str) -> _Topic:
-    """Return the only topic of these types, or the wanted one."""
+    """Return the wanted topic, or the only one of these types."""
     all_of_kind = {topic: count for topic, count in counts.items() if topic[0] in kinds}
     full = {topic: count for topic, count in all_of_kind.items() if count} or all_of_kind
     listed = ", ".join(f"{topic} ({count} messages)" for (_, topic), count in sorted(all_of_kind.items()))
@@ -290,7 +286,7 @@ _NO_ODOMETRY = "make it of the clouds: --odometry kiss-icp, or give --odometry F
 
 
 def _take_odometry(path: Path, counts: dict[_Topic, int], survey: _Survey) -> None:
-    """Take the odometry of the tree of frames."""
+    """Take the odometry from the frame tree."""
     found = survey.tree.odometry()
     if found is None:
         others = ", ".join(f"{topic} ({name})" for name, topic in sorted(counts)[:8])
@@ -305,15 +301,15 @@ def _take_odometry(path: Path, counts: dict[_Topic, int], survey: _Survey) -> No
 
 @dataclass(frozen=True)
 class _Mounted:
-    """How clouds come into the body frame."""
+    """How clouds get into the body frame."""
 
     mount: Mount
-    registered: bool = False  # they are in odometry's frame already
+    registered: bool = False  # already in odometry's frame
     notes: tuple[str, ...] = ()
 
 
 def _mounted(path: Path, survey: _Survey, given: Mount | None, explicit: Path | None = None) -> _Mounted:
-    """Return how clouds come into the body frame: as ``given``, else as the frames of the recording say.
+    """Return how clouds get into the body frame: as ``given``, else from the recording's frames.
 
     ``explicit`` odometry may be that of any frame.
     """
@@ -367,7 +363,7 @@ def _track(path: Path, survey: _Survey, explicit: Path | None, lone: bool) -> Tr
 
 
 def _steady(path: Path, stamps: Ints, noun: str) -> Bools:
-    """Return which stamps (N,) follow all earlier ones, nearly; RunError if the clock was reset."""
+    """Return which stamps (N,) are not far behind an earlier one; RunError if the clock was reset."""
     back = np.maximum.accumulate(stamps) - stamps
     strays = back > _MAX_SETBACK_NS
     if strays.sum() > _MAX_STRAYS * len(stamps):
@@ -400,7 +396,7 @@ def _in_order(path: Path, survey: _Survey) -> tuple[Ints, Ints, Bools, Bools]:
 
 
 def _pair(reader: BagReader, topic: _Topic, survey: _Survey, track: Track, mount: _Mounted) -> Run:
-    """Return the run of the clouds in order of their stamps, without those that have no odometry."""
+    """Return the run of clouds in order of their stamps, without those that have no odometry."""
     path = reader.path
     stamps, arrivals, fresh, steady = _in_order(path, survey)
     poses, known = track.at(stamps)
@@ -432,7 +428,7 @@ def _span(stamps: Ints) -> str:
 
 
 def _times(stamps: Ints, others: Ints) -> str:
-    """Return how many times as large stamps are as others, in words, where one is written in a wrong unit."""
+    """Return in words how many times larger some stamps are than others, if one is in a wrong unit."""
     for factor in (1e3, 1e6, 1e9):
         for small, large, noun in ((others, stamps, "clouds'"), (stamps, others, "odometry's")):
             if factor * small.max() >= large.min() and large.max() >= factor * small.min():

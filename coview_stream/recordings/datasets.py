@@ -1,7 +1,7 @@
-"""Runs of public datasets with layouts of their own: drives of KITTI's raw data, and MulRan.
+"""Runs of public datasets with their own layouts: drives of KITTI's raw data, and MulRan.
 
-Both have sweeps and poses at different stamps. Sweeps without poses around their stamps are left out and counted in the
-run's notes. The poses serve as odometry; nothing is read as the truth.
+In both, sweeps and poses have different stamps. Sweeps without poses around their stamps are left out and counted in
+the run's notes. The poses serve as odometry; nothing is read as ground truth.
 """
 
 from __future__ import annotations
@@ -33,16 +33,16 @@ _MAX_SKEW = 1e-3  # of a rotation matrix in text
 
 
 def is_kitti_raw(path: Path) -> bool:
-    """Return whether a directory is a drive of KITTI's raw data."""
+    """Whether a directory is a drive of KITTI's raw data."""
     return (path / _KITTI_SWEEPS / "data").is_dir()
 
 
 def open_kitti_raw(path: Path, mount: Mount | None = None) -> Run:
     """Open a drive of KITTI's raw data, with the poses of the car's inertial system (OXTS) as odometry.
 
-    The first pose lies at zero; its heading is kept, so the odometry frame is level. The body is the lidar if
-    ``calib_imu_to_velo.txt`` is in the drive's folder or its parent; otherwise the lidar is taken to sit at the
-    inertial system.
+    The first position is zero; its heading is kept, so the odometry frame is level. The body is the lidar if
+    ``calib_imu_to_velo.txt`` is in the drive's folder or its parent; else the lidar is assumed to be at the inertial
+    system.
 
     Raises:
         RunError: no sweeps, no poses, or a malformed line; the message names file and line.
@@ -64,14 +64,14 @@ def open_kitti_raw(path: Path, mount: Mount | None = None) -> Run:
 
 
 def find_sweeps(path: Path) -> Path | None:
-    """Return the folder of a MulRan run's sweeps; None if ``path`` is no such run."""
+    """Return the folder with a MulRan run's sweeps; None if ``path`` is not such a run."""
     return next((path / name for name in _MULRAN_SWEEPS if (path / name).is_dir()), None)
 
 
 def open_mulran(path: Path, sweeps: Path, mount: Mount | None = None) -> Run:
     """Open a MulRan run: Ouster sweeps named by their stamps, and the vehicle's poses in ``global_pose.csv``.
 
-    The clouds are the lidar's, the poses the vehicle's: ``mount`` (``--mount``) is the lidar's place on the vehicle.
+    The clouds are in the lidar's frame, the poses are the vehicle's: ``mount`` (``--mount``) is the lidar's pose on it.
 
     Raises:
         RunError: no sweeps, no poses, or a malformed line; the message names file and line.
@@ -98,7 +98,7 @@ def _paired(
     notes: tuple[str, ...],
     mount: Mount | None,
 ) -> Run:
-    """Return the run of the sweeps (N) between poses (K, 4, 4); stamps in float seconds or integer nanoseconds."""
+    """Return the run of sweeps (N) between poses (K, 4, 4); stamps in float seconds or integer nanoseconds."""
     unit = 1e-9 if stamps.dtype.kind == "i" else 1.0
     after = np.clip(np.searchsorted(pose_stamps, stamps), 1, len(pose_stamps) - 1)
     inside = (stamps >= pose_stamps[0]) & (stamps <= pose_stamps[-1])
@@ -121,7 +121,7 @@ def _paired(
 
 
 def _kitti_stamps(path: Path) -> Floats:
-    """Read stamps (N,) seconds, one a line: ``2011-09-26 13:02:25.964389445``."""
+    """Read stamps (N,) seconds, one per line: ``2011-09-26 13:02:25.964389445``."""
     stamps = []
     try:
         lines = path.read_text(encoding="ascii", errors="replace").splitlines()
@@ -142,7 +142,7 @@ def _kitti_stamps(path: Path) -> Floats:
 
 
 def _kitti_poses(folder: Path) -> tuple[Floats, Poses]:
-    """Read stamps (N,) seconds and poses (N, 4, 4) of the inertial system, the first position at zero."""
+    """Read stamps (N,) seconds and poses (N, 4, 4) of the inertial system, with the first position at zero."""
     files = sorted((folder / "data").glob("*.txt"))
     stamps = _kitti_stamps(folder / "timestamps.txt")
     if len(files) != len(stamps) or len(files) < 2:
@@ -158,7 +158,7 @@ def _kitti_poses(folder: Path) -> tuple[Floats, Poses]:
         rows.append(row[:_KITTI_COLUMNS])
     table = np.array(rows)
     latitude, longitude = np.radians(table[:, 0]), np.radians(table[:, 1])
-    scale = _EARTH * np.cos(latitude[0])  # of Mercator's projection: metres on the ground
+    scale = _EARTH * np.cos(latitude[0])  # of the Mercator projection: metres on the ground
     positions = np.column_stack([scale * longitude, scale * np.log(np.tan(np.pi / 4 + latitude / 2)), table[:, 2]])
     positions -= positions[0]
     turns = [rot_z(yaw) @ exp_so3([0.0, pitch, 0.0]) @ exp_so3([roll, 0.0, 0.0]) for roll, pitch, yaw in table[:, 3:]]

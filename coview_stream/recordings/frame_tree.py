@@ -1,4 +1,4 @@
-"""Frames of a recording, from ``/tf_static`` and ``/tf``: where the lidar is mounted, and odometry's frames."""
+"""Frames of a recording, from ``/tf_static`` and ``/tf``: the lidar's mount, and odometry's frames."""
 
 from __future__ import annotations
 
@@ -14,39 +14,35 @@ from coview_stream.messages.validation import checked_pose, stamp_join
 TYPES = ("tf2_msgs/msg/TFMessage", "tf/msg/tfMessage")
 
 _BODIES = ("base_link", "base_footprint", "base_frame", "body")
-"""Usual names of the body, the first that a tree has."""
+"""Usual names of the body; the first that a tree has counts."""
 _WORLDS = ("map", "world", "earth", "utm", "global")
-"""Frames above odometry's."""
-_SAME = 1e-6  # of a transform that is repeated
+"""Frames above odometry's frame."""
+_SAME = 1e-6  # difference below which a transform is repeated
 _MAX_FRAMES = 1000  # a hostile recording could name millions
 
 
 def read_transforms(payload: bytes) -> Iterator[tuple[int, str, str, Pose]]:
-    """Yield stamp in ns, parent, child and T_parent_child (4, 4) of a TFMessage in CDR; MessageError if damaged."""
+    """Yield stamp (ns), parent, child and T_parent_child (4, 4) from a TFMessage in CDR; MessageError if damaged."""
     for row in ros2.read(payload, TYPES[0]).transforms:
         t, q, stamp = row.transform.translation, row.transform.rotation, row.header.stamp
         try:
             T = checked_pose((t.x, t.y, t.z), (q.x, q.y, q.z, q.w))
-        except MessageError:  # a rotation of zeros, say; the other transforms are valid
+        except MessageError:  # a rotation of zeros, for example; the other transforms are valid
             continue
         yield stamp_join(stamp.sec, stamp.nanosec), row.header.frame_id.lstrip("/"), row.child_frame_id.lstrip("/"), T
 
 
 class FrameTree:
-    """Tree of a recording's frames.
-
-    Attributes:
-        lidar: frame of the clouds, once it is known; only the moving transforms above it are kept.
-    """
+    """Tree of a recording's frames; ``lidar`` is that of the clouds: only moving transforms above it are kept."""
 
     def __init__(self) -> None:
         self.lidar = ""
         self._parents: dict[str, tuple[str, Pose]] = {}  # by child
-        self._moved: set[str] = set()  # ROS 1 repeats transforms on /tf that never change
-        self._samples: dict[str, list[tuple[int, Pose]]] = {}  # by child, of those that are not static
+        self._moved: set[str] = set()  # ROS 1 repeats constant transforms on /tf
+        self._samples: dict[str, list[tuple[int, Pose]]] = {}  # by child; not for static transforms
 
     def add(self, payload: bytes, static: bool) -> None:
-        """Add the transforms of a TFMessage in CDR; a static one replaces that of before; MessageError if damaged."""
+        """Add the transforms in a CDR TFMessage; a static one replaces its predecessor; MessageError if damaged."""
         for stamp_ns, parent, child, T in read_transforms(payload):
             if static if child in self._parents else len(self._parents) < _MAX_FRAMES:
                 self._parents[child] = parent, T
@@ -60,12 +56,12 @@ class FrameTree:
                 self._samples.setdefault(child, []).append((stamp_ns, T))
 
     def body(self) -> str:
-        """Return the robot's frame by its usual names; empty if there is none above the lidar."""
+        """Return the robot's frame by its usual names; empty if none is above the lidar."""
         above = self.above(self.lidar)
         return next((name for name in _BODIES if name in above), "")
 
     def mount(self, body: str) -> Pose | None:
-        """Return T_body_lidar (4, 4); None if the frames are not connected, or move against each other."""
+        """Return T_body_lidar (4, 4); None if the frames are not connected, or move relative to each other."""
         of_body, of_lidar = self.above(body), self.above(self.lidar)
         common = next((name for name in of_lidar if name in of_body), None)
         if common is None:
@@ -81,9 +77,9 @@ class FrameTree:
         return np.asarray(inverse(T_common[0]) @ T_common[1])
 
     def odometry(self) -> tuple[str, str, list[tuple[int, Pose]]] | None:
-        """Return odometry's frame, the body's, and stamps in ns with T_odom_body (4, 4); None if there is none.
+        """Return odometry's frame, the body's, and stamps (ns) with T_odom_body (4, 4); None without odometry.
 
-        It is the highest transform above the lidar that moves, or is called odometry, but not in the map.
+        It is the highest transform above the lidar that moves, or is named odometry, but not one in the map.
         """
         moving = [
             child for child in self.above(self.lidar)[:-1]
@@ -93,7 +89,7 @@ class FrameTree:
         return (self._parents[moving[-1]][0], moving[-1], self._samples[moving[-1]]) if moving else None
 
     def above(self, name: str) -> list[str]:
-        """Return a frame and those above it, upward."""
+        """Return a frame and the frames above it, upward."""
         names = [name]
         while names[-1] in self._parents and self._parents[names[-1]][0] not in names:
             names.append(self._parents[names[-1]][0])

@@ -1,4 +1,4 @@
-"""Layouts of runs on disk: files of frames, stamps and odometry."""
+"""Layouts of runs on disk: frame files, stamps and odometry."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ _FOLDERS = {
     "velodyne_points/data": ("odometry.tum",),  # KITTI's raw data, whose own poses lie elsewhere
     "Scans": ("odom_poses.txt", "optimized_poses.txt"),  # saved by SC-LIO-SAM and SC-A-LOAM
 }
-"""Folders of frames, and files of odometry next to them; the first existing file counts."""
+"""Folders of frames, and odometry files next to them; the first existing file counts."""
 _LAYOUTS = (
     "frames/NNNNNN.pcd (ply, bin, npy, las, laz) beside odometry.tum, KITTI's velodyne/*.bin with times.txt and "
     "poses.txt, SC-LIO-SAM's Scans/*.pcd with times.txt and odom_poses.txt, MulRan's folders, a drive of KITTI's raw "
@@ -81,15 +81,15 @@ def find_layout(path: Path) -> Layout:
 
 
 def is_run(path: Path) -> bool:
-    """Return whether a path is a recording, or a directory with a run's frames."""
+    """Whether a path is a recording, or a directory with a run's frames."""
     return find_bag(path) is not None or any((path / folder).is_dir() for folder in _FOLDERS)
 
 
 def find_bag(path: Path) -> Path | None:
-    """Find the recording at ``path``: a file, or a rosbag2 directory; None if it is something else.
+    """Find the recording at ``path``: a file, or a rosbag2 directory; None for anything else.
 
     Raises:
-        RunError: a directory holds several recordings and no ``metadata.yaml``.
+        RunError: a directory holds several recordings but no ``metadata.yaml``.
     """
     if not path.is_dir():
         return path if path.suffix in _BAGS and path.is_file() else None
@@ -107,11 +107,7 @@ def find_bag(path: Path) -> Path | None:
 
 
 def _frames(folder: Path) -> tuple[Path, ...]:
-    """List the cloud files of a folder by number, or by name if one is no number.
-
-    Raises:
-        RunError: no cloud, two files of one number, or an entry that is no file.
-    """
+    """List a folder's cloud files by number, or by name if one has no number; RunError for none, twins or non-files."""
     files = [file for file in folder.iterdir() if is_cloud_name(file)]
     if not files:
         raise RunError(f"{folder}: no frames ({', '.join(sorted(CLOUD_SUFFIXES))}); put one cloud per scan there")
@@ -132,7 +128,7 @@ def read_odometry(layout: Layout, explicit: Path | None = None) -> tuple[Floats,
     """Read stamps (N,) in seconds and poses (N, 4, 4), odometry <- body, one per frame.
 
     Raises:
-        RunError: unreadable or invalid (file and line are named), or not as many as there are frames.
+        RunError: unreadable or invalid (file and line are named), or not one per frame.
     """
     file = explicit or layout.odometry
     assert file is not None
@@ -148,7 +144,7 @@ def read_stamps(layout: Layout) -> Floats | None:
     """Read stamps (N,) in seconds, one per frame, without the odometry; None if the run has none.
 
     Raises:
-        RunError: unreadable or invalid (file and line are named), or not as many as there are frames.
+        RunError: unreadable or invalid (file and line are named), or not one per frame.
     """
     file, stamps = layout.times, None
     if file is not None:
@@ -183,7 +179,7 @@ def _kitti(layout: Layout, file: Path) -> tuple[Floats, Poses]:
 
 
 def _calibration(path: Path) -> Pose | None:
-    """Read T_camera_velodyne (4, 4) from a KITTI ``calib.txt``; None without the file or without a Tr line."""
+    """Read T_camera_velodyne (4, 4) from a KITTI ``calib.txt``; None without the file or a Tr line."""
     if not path.is_file():
         return None
     try:

@@ -1,6 +1,6 @@
-"""Runs with odometry made from their clouds, and runs without odometry.
+"""Runs with odometry computed from their clouds, and runs without odometry.
 
-Lidar odometry takes a first pass over the clouds; they are read again on use.
+Lidar odometry makes a first pass over the clouds; they are read again on use.
 """
 
 from __future__ import annotations
@@ -34,10 +34,10 @@ def open_lidar_run(
     progress: Progress | None = None,
     mount: Mount | None = None,
 ) -> Run:
-    """Open a run as :func:`~coview_stream.recordings.open_run.open_run` does, with odometry made from its clouds.
+    """Open a run like :func:`~coview_stream.recordings.open_run.open_run`, with odometry computed from its clouds.
 
-    Frames in files count as deskewed; their stamps come from ``times.txt``, from ``odometry.tum``, or are 0.1 s apart.
-    Frames that odometry cannot place are left out and counted in the notes.
+    Frames in files count as deskewed; their stamps come from ``times.txt`` or ``odometry.tum``, else they are 0.1 s
+    apart. Frames that odometry cannot place are left out and counted in the notes.
 
     Raises:
         RunError: no frames, or odometry could place none. DependencyError: kiss-icp is missing.
@@ -123,13 +123,13 @@ def _place_all(
 
 
 def open_bare_run(path: Path, cloud_topic: str | None = None, mount: Mount | None = None) -> Run:
-    """Open a run as :func:`~coview_stream.recordings.open_run.open_run` does, but with the identity as every pose.
+    """Open a run like :func:`~coview_stream.recordings.open_run.open_run`, but with the identity for every pose.
 
-    Stamps of frames in files come from ``times.txt``, from ``odometry.tum``, or are 0.1 s apart. Clouds of recordings
-    are not deskewed.
+    Stamps of frames in files come from ``times.txt`` or ``odometry.tum``, else they are 0.1 s apart. Clouds of
+    recordings are not deskewed.
 
     Raises:
-        RunError: no frames, or stamps that do not fit.
+        RunError: no frames, or stamps that do not match.
     """
     if (bag := find_bag(path)) is not None:
         return open_bag(bag, None, cloud_topic, None, lambda clouds: Track(clouds.stamps, clouds.poses), mount)

@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 
 
 KISS_ICP = "kiss-icp"
-"""In place of an odometry file: make odometry from the clouds."""
+"""Instead of an odometry file: compute odometry from the clouds."""
 
 
 def open_run(
@@ -33,24 +33,24 @@ def open_run(
     """Open a run and validate everything but the clouds themselves.
 
     Layouts: ``frames/NNNNNN.{pcd,ply,bin,npy,las,laz}`` with ``odometry.tum``; KITTI (``velodyne/*.bin``,
-    ``times.txt``, ``poses.txt``, and ``calib.txt`` where the poses are the camera's); SC-LIO-SAM (``Scans/*.pcd``,
-    ``times.txt``, ``odom_poses.txt``); MulRan (``sensor_data/Ouster/*.bin``, ``global_pose.csv``); a drive of
-    KITTI's raw data (``velodyne_points/``, ``oxts/``); and recordings with PointCloud2 and Odometry (rosbag2 directory,
-    ``.mcap``, ``.db3``, ROS 1 ``.bag``), whose clouds get the odometry interpolated at their header stamps, and are
-    deskewed by it if their points have times. One cloud file, or one frame without odometry, is a run of one frame with
-    stamp 0 and the identity.
+    ``times.txt``, ``poses.txt``, and ``calib.txt`` if the poses are the camera's); SC-LIO-SAM (``Scans/*.pcd``,
+    ``times.txt``, ``odom_poses.txt``); MulRan (``sensor_data/Ouster/*.bin``, ``global_pose.csv``); a drive of KITTI's
+    raw data (``velodyne_points/``, ``oxts/``); and recordings with PointCloud2 and Odometry (rosbag2 directory,
+    ``.mcap``, ``.db3``, ROS 1 ``.bag``): odometry is interpolated at the clouds' header stamps, and deskews clouds
+    whose points have times. One cloud file, or one frame without odometry, is a run of one frame with stamp 0 and the
+    identity.
 
     Args:
         path: directory, cloud file or recording.
         odometry: ``"auto"`` takes the layout's own; otherwise a TUM file, or KITTI poses (12 columns) if the run has a
-            ``times.txt``. For a recording a TUM file with any stamps. ``"kiss-icp"`` makes odometry from the clouds, in
-            a pass over all of them: :mod:`coview_stream.odometry`.
+            ``times.txt``. For a recording a TUM file with any stamps. ``"kiss-icp"`` computes odometry in a pass over
+            all clouds: :mod:`coview_stream.odometry`.
         cloud_topic: topic of the clouds, if a recording has several with PointCloud2.
         odometry_topic: topic of the odometry, if a recording has several with Odometry.
         lidar: used for ``"kiss-icp"`` instead of a ``LidarOdometry()``.
         progress: called with (frames done, frames) during ``"kiss-icp"``.
         mount: pose of the lidar; clouds are read into the body frame, the frame of the odometry. None: the body itself,
-            or of a recording that of its /tf_static.
+            or for a recording that in its /tf_static.
 
     Raises:
         RunError: no frames, no odometry, or odometry that does not match; the message names file and line.

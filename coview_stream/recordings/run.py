@@ -48,7 +48,7 @@ class Frame:
 
 
 class CloudSource(Protocol):
-    """Reader of a run's clouds that are not in one file each."""
+    """Reader for a run's clouds that are not in one file each."""
 
     def read(self, index: int, correction: SweepCorrection | None = None) -> Cloud:
         """Read frame ``index`` in the body frame at its stamp, metres; CloudError if it is damaged."""
@@ -68,10 +68,10 @@ class _SelectedClouds:
 
 @dataclass(frozen=True, eq=False)
 class Run:
-    """A validated run. Iterating reads lazily: one frame is in memory at a time.
+    """A validated run. Iteration reads lazily: one frame is in memory at a time.
 
-    ``run[3]`` reads a frame, ``run[-1]`` the last one; ``run[10:20]`` and ``run[::5]`` are runs of these
-    frames, numbered from zero.
+    ``run[3]`` reads a frame, ``run[-1]`` the last one; ``run[10:20]`` and ``run[::5]`` are runs of these frames,
+    numbered from zero.
 
     Attributes:
         path: the directory, the single cloud file, or the recording.
@@ -79,8 +79,8 @@ class Run:
         stamps: (N,) seconds, strictly increasing.
         poses: (N, 4, 4), odometry <- body, metres.
         source: reads the clouds of a recording; None if each is a file.
-        notes: frames left out and assumptions made when the run was opened, a line each.
-        mount: pose of the lidar, whose clouds are read into the body frame; None if it is the body.
+        notes: frames left out and assumptions made when the run was opened, one line each.
+        mount: pose of the lidar, whose clouds are read into the body frame; None if the body is the lidar.
     """
 
     path: Path
@@ -105,7 +105,7 @@ class Run:
     def __getitem__(self, index: slice) -> Run: ...
 
     def __getitem__(self, index: SupportsIndex | slice) -> Frame | Run:
-        """Read one frame as :meth:`read`, negative indices from the end; or return the run of a slice.
+        """Read one frame like :meth:`read`, with negative indices from the end; or return the run of a slice.
 
         Raises:
             RunError: the slice is empty or goes backwards.
@@ -123,9 +123,9 @@ class Run:
         return replace(self, frames_paths=files, stamps=stamps, poses=poses, source=source)
 
     def with_late_clouds(self, delay: float) -> Run:
-        """Return the run with the times and odometry that its clouds were measured at, ``delay`` seconds before theirs.
+        """Return the run with each frame at the stamp and odometry ``delay`` seconds earlier, when it was measured.
 
-        Frames before the first odometry or after the last are left out; RunError if that is all of them.
+        Frames before the first odometry or after the last are left out; RunError if none remains.
         """
         stamps = self.stamps - delay
         first, end = np.searchsorted(stamps, self.stamps[0]), np.searchsorted(stamps, self.stamps[-1], "right")
@@ -149,7 +149,7 @@ class Run:
         )
 
     def read(self, index: int, correction: SweepCorrection | None = None) -> Frame:
-        """Read frame ``index``; a raw sweep of a recording is deskewed by odometry as corrected by ``correction``.
+        """Read frame ``index``; a recording's raw sweep is deskewed by odometry with ``correction`` applied.
 
         Raises:
             IndexError: there is no such frame.
@@ -173,5 +173,5 @@ class Run:
 
 
 def single_frame_run(layout: Layout, mount: Mount | None = None) -> Run:
-    """Return the run of one frame; it needs no odometry."""
+    """Return a run of one frame; it needs no odometry."""
     return Run(layout.path, layout.frames, np.zeros(1), np.eye(4)[None], mount=mount)

@@ -60,8 +60,6 @@ class AsyncLocalizer(SavedState):
     Close it, or use it in a ``with`` block.
 
     Attributes:
-        base_map: the map.
-        config: how decisions are made.
         engines: the processes, by name: ``track`` and ``search``.
     """
 

@@ -1,4 +1,4 @@
-"""Sink for Foxglove: a WebSocket server, a recording in MCAP, or both, with the same messages (``foxglove-sdk``)."""
+"""Sink for Foxglove: a WebSocket server, an MCAP recording, or both, with the same messages (``foxglove-sdk``)."""
 
 from __future__ import annotations
 
@@ -21,16 +21,16 @@ from coview_stream.viewers.scene import Scan, Sink
 
 _NS = 1_000_000_000
 _FRAME = "map"
-"""Frame of all that is drawn: the map's axes, about its origin, for viewers draw in float32."""
+"""Frame of all that is drawn: the map's axes at its origin, because viewers draw in float32."""
 _SOURCE = "map_source"
-"""Frame of the map's sources (UTM, say), whose child ``map`` is."""
+"""Frame of the map's sources (UTM, for example), the parent of ``map``."""
 _SIGMAS = 3.0  # of the covariance ellipsoid
 _COLOURS = {"TRACKING": (0.1, 0.7, 0.3), "AMBIGUOUS": (0.9, 0.6, 0.0), "LOST": (0.85, 0.15, 0.15)}
 _GREY = (0.4, 0.5, 0.7)
 
 
 class FoxgloveSink(Sink):
-    """Messages of Foxglove's schemas about a map and its robots.
+    """Foxglove messages for a map and its robots.
 
     Topics: ``/map``, ``/tf``, and for each robot ``/robots/NAME/`` ``pose``, ``scene`` (covariance), ``scan``,
     ``hypotheses``, ``status`` (the node's JSON) and ``state`` (changes, as a log).
@@ -39,7 +39,7 @@ class FoxgloveSink(Sink):
         by_stamp: log messages at their own stamps, as for recorded runs; otherwise at the current time.
 
     Raises:
-        DependencyError: there is no foxglove-sdk.
+        DependencyError: foxglove-sdk is missing.
     """
 
     def __init__(self, by_stamp: bool = False) -> None:
@@ -57,15 +57,11 @@ class FoxgloveSink(Sink):
         self._states: dict[str, str] = {}
 
     def serve(self, host: str, port: int) -> int:
-        """Open a WebSocket server, and return its port.
-
-        Raises:
-            ConfigError: the address cannot be listened on.
-        """
+        """Open a WebSocket server and return its port; ConfigError if the address cannot be bound."""
         sink = self
 
         class Greeter(self._sdk.ServerListener):  # type: ignore[misc, name-defined]  # the SDK is optional
-            """Sends the map to a client that connects later: the server keeps no messages."""
+            """Sends the map to each client that connects later: the server keeps no messages."""
 
             def on_subscribe(self, client: Any, channel: Any) -> None:
                 if channel.topic == "/map" and sink._map is not None:
@@ -75,7 +71,7 @@ class FoxgloveSink(Sink):
             server = self._sdk.start_server(
                 name="coview_stream", host=host, port=port, context=self._context, server_listener=Greeter()
             )
-        except Exception as error:  # RuntimeError or OSError, by version
+        except Exception as error:  # RuntimeError or OSError, depending on the version
             raise ConfigError(
                 f"--foxglove {host}:{port}: cannot be listened on ({error}); name another port"
             ) from error
@@ -83,10 +79,10 @@ class FoxgloveSink(Sink):
         return int(server.port)
 
     def record(self, path: Path) -> None:
-        """Record into an MCAP file from now on; it is whole after :meth:`close`, and not there if nothing came.
+        """Record into an MCAP file from now on; :meth:`close` completes it, or removes it if nothing came.
 
         Raises:
-            InputError: it is there already, or cannot be written.
+            InputError: it exists already, or cannot be written.
         """
         if path.exists():
             raise InputError(f"{path}: is there already; name another file")
@@ -110,7 +106,7 @@ class FoxgloveSink(Sink):
         self._log("/tf", "FrameTransforms", self._messages.FrameTransforms(transforms=[origin]))
 
     def pose(self, pose: PoseMessage) -> None:
-        """Draw a pose and how uncertain it is."""
+        """Draw a pose and its uncertainty."""
         m, stamp, name = self._messages, self._stamp(pose.stamp_ns), pose.robot
         T = pose.T_map_body
         place, (position, turn) = self._pose(T), self._parts(T)
@@ -132,7 +128,7 @@ class FoxgloveSink(Sink):
             self._log(f"/robots/{name}/scene", "SceneUpdate", m.SceneUpdate(entities=[entity]))
 
     def status(self, robot: str, status: dict[str, Any]) -> None:
-        """Hand on a status, and log a change of state."""
+        """Pass on a status, and log a change of state."""
         topic = f"/robots/{robot}/status"
         if topic not in self._channels:
             self._channels[topic] = self._sdk.Channel(topic, message_encoding="json", context=self._context)
@@ -155,7 +151,7 @@ class FoxgloveSink(Sink):
         self._log(f"/robots/{hypotheses.robot}/hypotheses", "PosesInFrame", message, hypotheses.stamp_ns)
 
     def scan(self, scan: Scan) -> None:
-        """Draw a scan where its pose is known."""
+        """Draw a scan if its pose is known."""
         if scan.T_map_body is None:
             return
         T = scan.T_map_body.copy()
@@ -212,15 +208,15 @@ class FoxgloveSink(Sink):
 def record_world(world: Path, out: Path, mount: Mount | None = None) -> int:
     """Write a simulated world as ``out`` (MCAP, Foxglove's schemas), at the run's stamps.
 
-    ``/robots/truth`` has the true poses and each scan in the map's frame; ``/robots/odometry`` starts there and goes
-    where odometry leads. ``mount`` is that of the lidar.
+    ``/robots/truth`` has the true poses and each scan in the map's frame; ``/robots/odometry`` starts there and follows
+    odometry. ``mount`` is the lidar's.
 
     Returns:
         Number of frames.
 
     Raises:
-        InputError: ``out`` is there already or cannot be written.
-        DependencyError: there is no foxglove-sdk.
+        InputError: ``out`` exists already or cannot be written.
+        DependencyError: foxglove-sdk is missing.
     """
     sink = FoxgloveSink(by_stamp=True)
     sink.record(out)

@@ -1,4 +1,4 @@
-"""Sink for rerun: its viewer on this machine, or a file that it opens later (``rerun-sdk``)."""
+"""Sink for rerun: its viewer on this machine, or a file to open later (``rerun-sdk``)."""
 
 from __future__ import annotations
 
@@ -22,14 +22,14 @@ from coview_stream.viewers.scene import Scan, Sink
 
 _HOST = "127.0.0.1"
 _MAX_START = 10.0  # seconds for the viewer to listen
-_STRIP = 50  # poses of one line strip: redrawing the whole path at each pose is quadratic
+_STRIP = 50  # poses per line strip: redrawing the whole path at each pose is quadratic
 _SIGMAS = 3.0  # of the covariance ellipsoid
 _AXES = ((220, 60, 60), (60, 180, 60), (70, 90, 230))  # x forward, y left, z up
 _GROUND, _STRUCTURE = (150, 150, 140), (90, 110, 140)
 
 
 class RerunSink(Sink):
-    """Map, poses, scans, hypotheses and states for rerun, about the map's origin: it draws in float32.
+    """Map, poses, scans, hypotheses and states for rerun, relative to the map's origin: rerun draws in float32.
 
     Args:
         save: file to write (``.rrd``); None opens the viewer, which listens on the loopback interface only.
@@ -61,7 +61,7 @@ class RerunSink(Sink):
         self._log("map/points", self._rerun.Points3D(view.points, colors=colours, radii=0.05), static=True)
 
     def pose(self, pose: PoseMessage) -> None:
-        """Draw a pose, the way to it and how uncertain it is."""
+        """Draw a pose, the path to it and its uncertainty."""
         T, name = self._local(pose.T_map_body), f"map/robots/{pose.robot}"
         self._at(pose.stamp_ns)
         row = pose_to_tum(T)
@@ -89,7 +89,7 @@ class RerunSink(Sink):
             self._log(f"map/robots/{robot}/state", self._rerun.TextLog(text, level=level))
 
     def hypotheses(self, hypotheses: HypothesesMessage) -> None:
-        """Draw the places that a search considers, the larger the more probable."""
+        """Draw the places that a search considers, larger if more probable."""
         if not len(hypotheses.places):
             return
         self._at(hypotheses.stamp_ns)
@@ -98,7 +98,7 @@ class RerunSink(Sink):
         self._log(f"map/robots/{hypotheses.robot}/hypotheses", self._rerun.Points3D(places, radii=sizes))
 
     def scan(self, scan: Scan) -> None:
-        """Draw a scan where its pose is known."""
+        """Draw a scan if its pose is known."""
         if scan.T_map_body is None:
             return
         self._at(scan.stamp_ns)
@@ -116,7 +116,7 @@ class RerunSink(Sink):
         return out
 
     def _zero(self, place: Floats) -> Floats:
-        """Return the map's origin, or the first place while the map is not known."""
+        """Return the map's origin, or the first place while the map is unknown."""
         if self._origin is None:
             self._origin = np.asarray(np.round(place), dtype=np.float64)
         return self._origin
@@ -129,7 +129,7 @@ class RerunSink(Sink):
 
 
 def _start_viewer() -> int:
-    """Start the viewer that the library brings, on the loopback interface, and return its port."""
+    """Start the library's viewer on the loopback interface, and return its port."""
     if sys.platform.startswith("linux") and not (os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY")):
         raise ConfigError(
             "--rerun: there is no display here; write a file with --record FILE.rrd, and open it elsewhere"
@@ -145,7 +145,7 @@ def _start_viewer() -> int:
         remedy = f"{PIP_INSTALL} --force-reinstall 'rerun-sdk>=0.20'"
         raise DependencyError(f"--rerun: its viewer is not installed; {remedy}")
     command, nothing = [str(viewer), "--bind", _HOST, "--port", str(port)], subprocess.DEVNULL
-    # in a session of its own it stays when we end
+    # in its own session it outlives this process
     process = subprocess.Popen(command, stdin=nothing, stdout=nothing, stderr=nothing, start_new_session=True)
     deadline = time.monotonic() + _MAX_START
     while time.monotonic() < deadline:

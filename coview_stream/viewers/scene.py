@@ -1,4 +1,4 @@
-"""Scene of a session as plain data, and the interface of its viewers.
+"""A session's scene as plain data, and the interface of its viewers.
 
 Poses and hypotheses are the messages themselves (:class:`~coview_stream.messages.types.PoseMessage`,
 :class:`~coview_stream.messages.types.HypothesesMessage`), a status is the node's JSON, and the map is a
@@ -18,8 +18,8 @@ from coview_stream.geometry.transforms import Points, Pose, interpolate
 from coview_stream.messages.types import HypothesesMessage, PoseMessage
 
 _KEPT = 64  # poses of a robot, for its scans
-_TOLERANCE_NS = 150_000_000  # beyond the first or last pose, which then serves
-_MAX_GAP_NS = 2_000_000_000  # between two poses to interpolate
+_TOLERANCE_NS = 150_000_000  # beyond the first or last pose, which is then used
+_MAX_GAP_NS = 2_000_000_000  # largest gap between two poses to interpolate
 
 
 @dataclass(frozen=True, eq=False)
@@ -43,39 +43,39 @@ class Sink:
     """
 
     def map(self, view: MapView) -> None:
-        """Take in the map: the first known one, and any served later."""
+        """Take the map: the first known one, and any served later."""
 
     def pose(self, pose: PoseMessage) -> None:
-        """Take in a pose; ``pose.robot`` is always set."""
+        """Take a pose; ``pose.robot`` is always set."""
 
     def status(self, robot: str, status: dict[str, Any]) -> None:
-        """Take in a node's status of a robot: JSON from the network, no field of which is certain."""
+        """Take a robot's status from its node: JSON from the network, in which any field may be missing."""
 
     def hypotheses(self, hypotheses: HypothesesMessage) -> None:
-        """Take in the places that a search considers; outdated once a status or a pose says ``TRACKING``."""
+        """Take the places that a search considers; outdated once a status or a pose says ``TRACKING``."""
 
     def scan(self, scan: Scan) -> None:
-        """Take in a lidar frame, a few a second at most."""
+        """Take a lidar frame, a few a second at most."""
 
     def close(self) -> None:
         """Finish: nothing more comes."""
 
 
 class PoseTrack:
-    """Newest poses of one robot, to be interpolated at a scan's stamp."""
+    """Newest poses of one robot, for interpolation at a scan's stamp."""
 
     def __init__(self) -> None:
         self._poses: deque[tuple[int, Pose]] = deque(maxlen=_KEPT)
 
     def add(self, stamp_ns: int, T_map_body: Pose) -> None:
-        """Take in a pose; a stamp that goes back starts a new track."""
+        """Add a pose; a stamp that goes back starts a new track."""
         if self._poses and stamp_ns < self._poses[-1][0]:
             self._poses.clear()
         if not self._poses or stamp_ns > self._poses[-1][0]:
             self._poses.append((stamp_ns, T_map_body))
 
     def reaches(self, stamp_ns: int) -> bool:
-        """Tell whether a pose of this stamp or a later one has come."""
+        """Whether a pose with this stamp or a later one has come."""
         return bool(self._poses) and self._poses[-1][0] >= stamp_ns
 
     def at(self, stamp_ns: int) -> Pose | None:

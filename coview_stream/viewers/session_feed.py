@@ -1,6 +1,6 @@
 """Feed of a session: subscribes to robots' poses, statuses, hypotheses and clouds, and hands them to sinks.
 
-The network's threads only queue. One thread decodes and calls the sinks; another one asks for the map.
+The network's threads only queue. One thread decodes and calls the sinks; another requests the map.
 """
 
 from __future__ import annotations
@@ -28,14 +28,14 @@ from coview_stream.stream.transport.keys import RobotKeys, check_prefix
 from coview_stream.stream.transport.transport import Policy, Transport
 from coview_stream.viewers.scene import PoseTrack, Scan, Sink
 
-_TIMEOUT = 10.0  # seconds of a query: the first makes the node thin its map
+_TIMEOUT = 10.0  # seconds for a query: at the first one the node thins its map
 
 MapSource = Callable[[str], MapView]
-"""Returns the map that a robot is served on, or raises a CoViewError."""
+"""Returns the map that serves a robot, or raises a CoViewError."""
 
 
 def asked_of_node(transport: Transport, base: str) -> MapSource:
-    """Return a map source that asks the node of a robot."""
+    """Return a map source that queries a robot's node."""
 
     def ask(robot: str) -> MapView:
         key = f"{base}/{robot}/rpc/map_view"
@@ -45,7 +45,7 @@ def asked_of_node(transport: Transport, base: str) -> MapSource:
 
 
 def read_from_files(files: Mapping[str, Path], sha256: Callable[[], str]) -> MapSource:
-    """Return a map source that reads a node's files, by the hash of the map that the node serves: ``sha256()``."""
+    """Return a map source that reads a node's files, given the hash of the served map: ``sha256()``."""
     from coview_stream.basemap.basemap import load_served
 
     return lambda robot: MapView.of(load_served(files, sha256()))
@@ -60,18 +60,18 @@ class Topic(NamedTuple):
     key: str
     kind: TopicKind
     robot: str | None = None
-    """Robot of all messages; None to read it from the samples' keys, where ``depth`` chunks precede it."""
+    """Robot of all messages; None: it is in the samples' keys, after ``depth`` chunks."""
     hint: str | None = None
-    """Codec of messages without an Encoding."""
+    """Codec of messages without Encoding."""
     depth: int = 0
 
     def robot_of(self, sample: Sample) -> str:
-        """Return the robot that a sample is about."""
+        """Return the robot that a sample belongs to."""
         return self.robot or sample.key.split("/")[self.depth]
 
 
 def topics_of_robots(keys: Sequence[RobotKeys]) -> list[Topic]:
-    """Return the topics of named robots, of any preset."""
+    """Return the topics of named robots, for any preset."""
     topics = []
     for k in keys:
         topics += [Topic(k.pose, "pose", k.robot, k.hint), Topic(k.cloud, "cloud", k.robot, k.hint)]
@@ -80,7 +80,7 @@ def topics_of_robots(keys: Sequence[RobotKeys]) -> list[Topic]:
 
 
 def topics_of_base(base: str) -> list[Topic]:
-    """Return the topics of all robots of a base, with native keys; ConfigError if it cannot start a key."""
+    """Return the topics of all robots under a base, with native keys; ConfigError if it cannot start a key."""
     base = check_prefix(base, "--base")
     depth = len(base.split("/"))
     ends: tuple[tuple[str, TopicKind], ...] = (
@@ -95,24 +95,22 @@ MAX_ROBOTS = 256
 """Limit of robots in view: names come from the network."""
 _MAX_QUEUED = 4_000  # messages waiting for slow sinks
 _POLL = 0.05  # seconds
-_SCAN_PERIOD = 0.2  # seconds between two scans of a robot that are decoded
+_SCAN_PERIOD = 0.2  # seconds between decoded scans of a robot
 _SCAN_POINTS = 6_000
-_POSE_WAIT = 0.4  # seconds that a scan waits for a pose of its time
-_JOIN_TIMEOUT = 0.2  # seconds for a thread to end; the map's thread may be busy for longer
-_MAP_RETRY = 5.0  # seconds between two questions for a map
+_POSE_WAIT = 0.4  # seconds that a scan waits for a pose at its time
+_JOIN_TIMEOUT = 0.2  # seconds for a thread to end; the map's thread may be busy longer
+_MAP_RETRY = 5.0  # seconds between requests for a map
 
 
 class SessionFeed:
     """Subscriptions to robots' poses, statuses, hypotheses and clouds, decoded for sinks; a context manager.
 
     Args:
-        transport: stays the caller's.
-        topics: subscriptions.
-        map_view: the map, if it is known.
-        map_source: called with a robot's name when its status names an unknown map; None for no map.
+        transport: the caller closes it.
+        map_source: called with a robot's name when its status names an unknown map; None: no map.
         clouds: whether to subscribe to clouds, most of the traffic.
         mount: pose of the lidars on their robots, as in ``serve --mount``.
-        policy: ``newest`` where a full queue must not hold up the publisher, as in the node's own process.
+        policy: ``newest`` if a full queue must not block the publisher, as in the node's own process.
     """
 
     def __init__(
@@ -133,11 +131,11 @@ class SessionFeed:
         self._errors = RateLimitedErrors(_log)
         self._inbox: LatestQueue[tuple[Topic, Sample] | MapView] = LatestQueue(_MAX_QUEUED)
         self._clouds: dict[str, tuple[Topic, Sample]] = {}  # newest of each robot
-        self._lock = threading.Lock()  # of that and of the sinks
+        self._lock = threading.Lock()  # of the newest clouds and the sinks
         self._sinks: list[Sink] = []
         self._maps: dict[str, MapView] = {}
-        self._wanted: LatestQueue[str] = LatestQueue(8)  # robots whose map is not known
-        self._asked: dict[str, float] = {}  # by hash, when that was last asked for
+        self._wanted: LatestQueue[str] = LatestQueue(8)  # robots whose map is unknown
+        self._asked: dict[str, float] = {}  # time of the last request, by hash
         self._robots: set[str] = set()
         self._tracks: dict[str, PoseTrack] = {}
         self._pending: dict[str, tuple[float, Scan]] = {}  # scans that wait for a pose, and until when
@@ -148,11 +146,11 @@ class SessionFeed:
             self._inbox.put(map_view)
 
     def add(self, sink: Sink) -> None:
-        """Hand all further events to a sink, and the known maps."""
+        """Hand all further events, and the known maps, to a sink."""
         with self._lock:
             self._sinks.append(sink)
             maps = list(self._maps.values())
-        for view in maps:  # on the feed's thread, and to all sinks again
+        for view in maps:  # on the feed's thread, and again to all sinks
             self._inbox.put(view)
 
     def start(self) -> None:
@@ -233,13 +231,13 @@ class SessionFeed:
             self._errors.report(sample.key, error)
 
     def _admits(self, robot: str) -> bool:
-        """Add a robot, up to the limit, and return whether it is one of the robots in view."""
+        """Add a robot, up to the limit; return whether it is in view."""
         if len(self._robots) < MAX_ROBOTS:
             self._robots.add(robot)
         return robot in self._robots
 
     def _on_view(self, pose: PoseMessage) -> PoseMessage:
-        """Return a pose in the frame of the view, in which several maps lie side by side."""
+        """Return a pose in the frame of the view, which shows several maps side by side."""
         view = self._maps.get(pose.map_sha256)
         for part in (view.parts if view else None) or ():
             if part.name == pose.frame_id:
@@ -265,7 +263,7 @@ class SessionFeed:
         self._hand_out("status", lambda sink: sink.status(robot, status))
 
     def _take_clouds(self, now: float) -> None:
-        """Decode the clouds that are due, and hand out the scans whose wait for a pose is over."""
+        """Decode the clouds that are due, and hand out the scans that no longer wait for a pose."""
         with self._lock:
             due = [robot for robot in self._clouds if self._next_scan.get(robot, 0.0) <= now]
             clouds = {robot: self._clouds.pop(robot) for robot in due if robot not in self._pending}
@@ -305,5 +303,5 @@ class SessionFeed:
                 continue
             try:
                 self._inbox.put(self._map_source(robot))
-            except Exception as error:  # the next map may be another one
+            except Exception as error:  # the next map may succeed
                 self._errors.report(f"map of {robot}", error)

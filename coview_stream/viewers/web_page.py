@@ -1,4 +1,4 @@
-"""Web page of a session: its files, the map and the events, on an HTTP server. Read only, without dependencies."""
+"""Web page of a session: its files, the map and the events, on an HTTP server. Read-only, without dependencies."""
 
 from __future__ import annotations
 
@@ -16,17 +16,10 @@ _FILES = ("index.html", "style.css", "page.js", "state.js", "raster.js", "view.j
 
 
 class WebPage:
-    """A page that is served from its creation on; add :attr:`sink` to a feed, which closes it.
-
-    Args:
-        address: ``HOST:PORT``.
-
-    Attributes:
-        url: of the page.
-        sink: takes in the events.
+    """A page, served once created; add :attr:`sink` to a feed, which closes it. ``url`` is its address.
 
     Raises:
-        ConfigError: ``address`` is malformed or cannot be listened on.
+        ConfigError: ``address`` (``HOST:PORT``) is malformed or cannot be bound.
     """
 
     def __init__(self, address: str) -> None:

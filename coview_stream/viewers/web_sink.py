@@ -1,6 +1,6 @@
 """Sink and hub of the web page: events for every open page at its own pace, and the robots' trails.
 
-Of each kind of event about a robot a page holds the newest only, so that a slow page delays no other.
+A page keeps only the newest event of each kind per robot, so that a slow page delays no other.
 """
 
 from __future__ import annotations
@@ -24,14 +24,14 @@ from coview_stream.viewers.scene import Scan, Sink
 
 MAX_PAGES = 8
 """Pages served at a time."""
-_MAX_KEPT = 4_000  # events that a page may have to take: four kinds of a thousand robots
+_MAX_KEPT = 4_000  # events that a page may hold: four kinds for a thousand robots
 
 Slot = tuple[str, str]
-"""Kind of an event, and the robot or map that it is about."""
+"""Kind of an event, and its robot or map."""
 
 
 class Page:
-    """Events that one page has not read yet: one for each slot, in order of arrival."""
+    """Events that one page has not read: one per slot, in order of arrival."""
 
     def __init__(self) -> None:
         self._events: OrderedDict[Slot, bytes] = OrderedDict()
@@ -39,7 +39,7 @@ class Page:
         self.closed = False
 
     def put(self, slot: Slot, event: bytes) -> None:
-        """Add an event in place of the one before in its slot."""
+        """Add an event; it replaces the previous one in its slot."""
         with self._changed:
             self._events.pop(slot, None)
             if len(self._events) < _MAX_KEPT and not self.closed:
@@ -47,7 +47,7 @@ class Page:
                 self._changed.notify()
 
     def take(self, timeout: float) -> bytes:
-        """Take all events; empty if there is none for ``timeout`` seconds, or it is closed."""
+        """Take all events; empty if none comes for ``timeout`` seconds, or the page is closed."""
         with self._changed:
             if not self._events and not self.closed:
                 self._changed.wait(timeout)
@@ -56,7 +56,7 @@ class Page:
         return taken
 
     def close(self) -> None:
-        """Wake the taker; nothing more comes."""
+        """Wake the reader; nothing more comes."""
         with self._changed:
             self.closed = True
             self._events.clear()
@@ -64,7 +64,7 @@ class Page:
 
 
 class WebHub:
-    """All open pages, and the events that a new one gets first."""
+    """All open pages, and the events that a new page gets first."""
 
     def __init__(self) -> None:
         self._lock = threading.Lock()
@@ -75,11 +75,11 @@ class WebHub:
 
     @property
     def pages(self) -> int:
-        """Number of pages that are open."""
+        """Number of open pages."""
         return len(self._pages)
 
     def publish(self, kind: str, about: str, data: dict[str, Any], keep: bool = True) -> None:
-        """Send an event to all pages, and, if it is kept, to those that open later."""
+        """Send an event to all pages and, if it is kept, to those opened later."""
         slot, event = (kind, about), encode_event(kind, data)
         with self._lock:
             if keep and (slot in self._kept or len(self._kept) < _MAX_KEPT):
@@ -89,7 +89,7 @@ class WebHub:
             page.put(slot, event)
 
     def open_page(self) -> Page | None:
-        """Return a new page with the first and the kept events; None if there are too many."""
+        """Return a new page with the first and the kept events; None if too many are open."""
         page = Page()
         for number, event in enumerate(self.first()):
             page.put(("first", str(number)), event)
@@ -109,7 +109,7 @@ class WebHub:
                 self._pages.remove(page)
 
     def close(self) -> None:
-        """Close all pages; none can be opened any more."""
+        """Close all pages; none can be opened afterwards."""
         with self._lock:
             self._closed = True
             pages = list(self._pages)
@@ -118,18 +118,18 @@ class WebHub:
 
 
 def encode_event(kind: str, data: dict[str, Any]) -> bytes:
-    """Return a server-sent event; ValueError for NaN, which JSON cannot say."""
+    """Return a server-sent event; ValueError for NaN, which JSON lacks."""
     return f"event: {kind}\ndata: {json.dumps(data, allow_nan=False, separators=(',', ':'))}\n\n".encode()
 
 
 _TRAIL = 4_000  # points of a robot's trail
-_TRAIL_STEP = 0.25  # metres between them
-_TRAIL_GAP = 2.0  # seconds without a pose: the trail is interrupted
-_MAX_TEXT = 500  # letters of a text from the network
+_TRAIL_STEP = 0.25  # metres between its points
+_TRAIL_GAP = 2.0  # seconds without a pose that interrupt the trail
+_MAX_TEXT = 500  # characters of a text from the network
 _MAX_TEXTS = 8
 _SCAN_POINTS = 3_000
 _SCAN_STEP = 0.01  # metres
-_MAPS = 4  # that are kept
+_MAPS = 4  # maps kept
 
 _STATUS = ("state", "reason", "version", "map_sha256", "odometry", "uptime_s", "stamp_ns")
 _PARTS = {
@@ -141,11 +141,7 @@ _PARTS = {
 
 
 class WebSink(Sink):
-    """Events of a session for the pages of a hub; ``close`` is called at the end.
-
-    Attributes:
-        maps: packed maps by hash, see :func:`packed_map`.
-    """
+    """Events of a session for the pages of a hub, which read ``maps``, packed by hash; calls ``close`` at the end."""
 
     def __init__(self, hub: WebHub, close: Callable[[], None]) -> None:
         self.maps: dict[str, bytes] = {}
@@ -156,7 +152,7 @@ class WebSink(Sink):
         hub.first = self._trail_events
 
     def map(self, view: MapView) -> None:
-        """Keep the map for the pages to read, and tell them."""
+        """Keep the map for pages to fetch, and announce it."""
         if view.sha256 in self.maps:
             return
         while len(self.maps) >= _MAPS:
@@ -165,7 +161,7 @@ class WebSink(Sink):
         self._hub.publish("map", view.sha256, {"sha256": view.sha256, "count": len(view.points)})
 
     def pose(self, pose: PoseMessage) -> None:
-        """Tell a pose, and continue the trail."""
+        """Publish a pose, and continue the trail."""
         x, y, z = (float(c) for c in pose.T_map_body[:3, 3])
         covariance = pose.covariance
         known = bool(np.isfinite(covariance).all())
@@ -202,7 +198,7 @@ class WebSink(Sink):
         self._hub.publish("status", robot, data)
 
     def hypotheses(self, hypotheses: HypothesesMessage) -> None:
-        """Tell the places that a search considers."""
+        """Publish the places that a search considers."""
         names = ("x", "y", "z", "yaw", "probability")
         places = [dict(zip(names, np.round(row[:5], 5).tolist(), strict=True)) for row in hypotheses.places]
         self._hub.publish(
@@ -217,7 +213,7 @@ class WebSink(Sink):
         )
 
     def scan(self, scan: Scan) -> None:
-        """Send a scan, in the map frame where the pose is known; nothing while no page is open."""
+        """Publish a scan, in the map frame if its pose is known; nothing while no page is open."""
         if not self._hub.pages:
             return
         points = scan.points[:: max(1, -(-len(scan.points) // _SCAN_POINTS))]
@@ -265,10 +261,10 @@ class WebSink(Sink):
 
 
 def packed_map(view: MapView) -> bytes:
-    """Return a map as the page reads it.
+    """Return a map in the form that the page reads.
 
-    Four bytes of the header's length, the header (JSON, padded to a multiple of four bytes), and little-endian int16
-    x, y, z of the points in ``step`` metres from ``origin``, the ``ground`` points of the ground first.
+    The length of the header in four bytes, the header (JSON, padded to a multiple of four bytes), and the points x, y,
+    z as little-endian int16, in units of ``step`` metres from ``origin``, first the ``ground`` points of the ground.
     """
     data = view.to_json()
     header = {name: data[name] for name in ("map_sha256", "crs", "origin", "step_m", "count", "ground")}
@@ -286,14 +282,14 @@ def _finite(value: float) -> float | None:
 
 
 def _plain(value: object) -> str | float | bool | None:
-    """Return a text, cut, or a finite number; None for all else."""
+    """Return a text, truncated, or a finite number; None for anything else."""
     if isinstance(value, str):
         return value[:_MAX_TEXT]
     if isinstance(value, bool):
         return value
     try:
         return _finite(float(value)) if isinstance(value, int | float) else None
-    except OverflowError:  # integers of JSON have no limit
+    except OverflowError:  # JSON integers have no limit
         return None
 
 

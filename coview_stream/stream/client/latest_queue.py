@@ -52,10 +52,7 @@ class LatestQueue(Generic[_Item]):
             return self._items.popleft() if self._items else None
 
     async def next(self, timeout: float | None = None) -> _Item | None:
-        """Take the oldest item as :meth:`get` does, without blocking the event loop.
-
-        If cancelled it takes nothing: the next reader gets the item.
-        """
+        """Take the oldest item as :meth:`get` does, without blocking the event loop; if cancelled, take nothing."""
         import asyncio
 
         loop, arrived = asyncio.get_running_loop(), asyncio.Event()

@@ -38,11 +38,7 @@ class MapServer:
         listen: Sequence[str] = (),
         config: Path | None = None,
     ) -> None:
-        """Open a session and start answering.
-
-        Raises:
-            MapError: the directory is not a site. TransportError: the network cannot be used.
-        """
+        """Open a session and start answering; MapError if the directory is no site, TransportError without network."""
         import zenoh
 
         self._raw = read_manifest(directory)

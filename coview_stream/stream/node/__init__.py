@@ -1,1 +1,1 @@
-"""The node: sessions of robots, engines in processes of their own, poses at 10 Hz."""
+"""The node: sessions of robots, engines in their own processes, poses at 10 Hz."""

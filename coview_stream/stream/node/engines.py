@@ -167,11 +167,7 @@ class SearchEngine(Engine):
 
 
 class OdometryEngine(Engine):
-    """One :class:`LidarOdometry` per robot, each with its own ``registration``.
-
-    Raises:
-        DependencyError: kiss-icp is missing or cannot be loaded; the message says how to get it.
-    """
+    """One :class:`LidarOdometry` per robot, with its own ``registration``; DependencyError if kiss-icp is missing."""
 
     def __init__(self, registration: Callable[[LidarOdometryConfig], ScanRegistration] = KissRegistration) -> None:
         self._registration = registration

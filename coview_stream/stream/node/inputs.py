@@ -1,7 +1,7 @@
 """Inputs of one robot: clouds and odometry, decoded and paired by their stamps.
 
-For a robot without odometry it is computed from the clouds (:class:`LidarInputs`). Pure logic; the session, which is
-pure too, holds the lock.
+If a robot sends no odometry, it is computed from the clouds (:class:`LidarInputs`). Pure logic, like the session, which
+holds the lock.
 """
 
 from __future__ import annotations
@@ -159,11 +159,7 @@ class FrameSync:
 
 
 class NewestStamp:
-    """The newest stamp of an input.
-
-    Attributes:
-        came_at: local time of the newest message, whatever its stamp.
-    """
+    """The newest stamp of an input; ``came_at`` is the local time of the newest message, whatever its stamp."""
 
     def __init__(self) -> None:
         self.came_at = self._later_at = _NEVER  # _later_at: of the newest message with a later stamp
@@ -374,10 +370,7 @@ class LidarInputs(Inputs):
         return OdometryJob(self.keys.robot, self._epoch, message.stamp_ns, message.points, times, self.lidar)
 
     def job_done(self, job: OdometryJob, result: OdometryResult, now: float) -> Iterator[Break]:
-        """Add a frame's odometry, then the frame; the caller applies each break before it continues the iteration.
-
-        Jobs from before a reset are ignored.
-        """
+        """Add a frame's odometry and the frame, unless from before a reset; apply each break before continuing."""
         if job.epoch < self._first_epoch:
             return
         frame, self._under_way = self._under_way, None

@@ -1,4 +1,4 @@
-"""Last place of a robot: its file, its message to another node, and guesses by people.
+"""Last place of a robot: its file, its message to another node, and user guesses.
 
 Each is a hypothesis, which the engine verifies like any other
 (:meth:`coview_stream.localization.localizer.Localizer.hint_pose`).
@@ -171,7 +171,7 @@ def _open_regular(path: Path) -> BinaryIO:
     return file
 
 
-# ---- guesses by people: parameters of a query, JSON, or RViz's pose
+# ---- user guesses: parameters of a query, JSON, or RViz's pose
 
 
 def guess_of_fields(given: Mapping[str, Any]) -> PlaceGuess:

@@ -62,9 +62,7 @@ class Node:
     """Serves several robots on one map.
 
     Args:
-        opened: the map.
         transport: source and destination of messages; the node closes it.
-        config: rates and limits.
         pose_format: codec of the poses; None: each robot's keys decide.
         geo: also publishes poses as places on Earth; None: does not.
         shared: a fleet decides which robots this node serves; else it serves all.

@@ -91,11 +91,8 @@ def open_node(
 ) -> Node:
     """Load the map in the engines, open the network and start; an error leaves nothing running.
 
-    Args:
-        options: options of ``serve``.
-        cancelled: polled; True gives up.
-        children: from :func:`start_children`, if the engines have been started.
-        notifier: for systemd; the caller uses it to report that the service ends.
+    ``cancelled`` is polled; True gives up. ``children`` come from :func:`start_children`, if the engines have been
+    started. With ``notifier`` the caller reports to systemd that the service ends.
 
     Raises:
         MapError: the map is unusable. TransportError: no network.
@@ -216,7 +213,7 @@ def _services(options: ServeOptions, node: Node, notifier: Notifier) -> dict[str
 def start_engines(
     options: ServeOptions, children: Mapping[str, EngineChild], base_map: BaseMap | None = None
 ) -> tuple[BaseMap, dict[str, EngineProcess]]:
-    """Check the map and let the engines, made of ``children``, start opening it; return both.
+    """Check the map and let the engines, which take over ``children``, start opening it; return both.
 
     The caller starts the search engine: it would take cores from the engines that the node waits for. ``base_map`` is
     the map, if it is already loaded and verified. After an error the caller closes the children.

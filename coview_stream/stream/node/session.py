@@ -38,9 +38,6 @@ class Session:
     """A robot's inputs, its queue to the engines and its state, behind one lock.
 
     Args:
-        keys: keys of the robot's messages.
-        map_sha256: hash of the map.
-        config: rates and limits.
         codecs: for clouds and odometry; they override the messages' own encodings.
         parts: the maps joined in this map; None for a single map.
         lidar: how odometry is computed from the clouds; None if the robot sends it.

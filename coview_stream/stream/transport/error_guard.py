@@ -31,7 +31,6 @@ class RateLimitedErrors:
     """Log of handler errors: the first of each kind at once, then at most one line per ``interval``.
 
     Args:
-        logger: receives the lines.
         interval: seconds between lines about the same place.
         clock: monotonic, seconds.
     """

@@ -62,15 +62,8 @@ Route = Callable[[str], Reply | EventStream]
 class HttpServer:
     """Server of some routes on one address, ``HOST:PORT``; port 0 takes any free port. There is no password.
 
-    ``url`` is the root's, with a final ``/``.
-
-    Args:
-        address: address to listen on.
-        routes: handlers by path.
-        option: command-line option for the address and a valid value, for messages.
-
-    Raises:
-        ConfigError: the address is malformed or cannot be bound.
+    ``url`` is the root's, with a final ``/``; ``routes`` are handlers by path; ``option`` is the command-line option
+    for the address and a valid value, for messages. ConfigError if the address is malformed or cannot be bound.
     """
 
     def __init__(self, address: str, routes: Mapping[str, Route], option: tuple[str, str]) -> None:

@@ -44,10 +44,8 @@ class MemoryTransport:
 
     Attributes:
         published: every sample that reached the network, in order, from publishers and from :meth:`publish`.
-        publishers: every declared publisher.
         lost: number of samples published while the network was away.
         raised: exceptions raised by handlers, in order.
-        closed: whether :meth:`close` was called.
     """
 
     def __init__(self) -> None:

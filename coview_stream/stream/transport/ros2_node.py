@@ -53,11 +53,7 @@ def _import_rclpy() -> Any:
 
 
 def settings_of(node: Any) -> dict[str, Any]:
-    """Return a node's parameters, except its own; those with dots as tables.
-
-    Raises:
-        ConfigError: a name is used for both a value and a table.
-    """
+    """Return a node's parameters, except its own; dots make tables. ConfigError if a name is a value and a table."""
     settings: dict[str, Any] = {}
     for name, parameter in sorted(node.get_parameters_by_prefix("").items()):
         if name in _OWN_PARAMETERS or name.startswith("qos_overrides."):

@@ -266,10 +266,7 @@ def size_of(sample: Any) -> int:
 
 
 class Inbox:
-    """Samples of one subscription; the oldest are dropped if they are too many, or too large together.
-
-    One sample is handled at a time.
-    """
+    """Samples of one subscription, handled one at a time; of too many, or too large ones, the oldest are dropped."""
 
     def __init__(self, name: str, handle: Callable[[Any], None], size: int, ready: SimpleQueue[Inbox | None]) -> None:
         self.name = name
