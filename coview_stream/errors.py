@@ -39,7 +39,7 @@ class ConfigError(CoViewError, ValueError):
 
 
 class InputError(CoViewError, ValueError):
-    """Input cannot be used: an argument, a file or a message."""
+    """Input cannot be used."""
 
 
 class CloudError(InputError):

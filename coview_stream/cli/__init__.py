@@ -150,10 +150,7 @@ def build_parser(only: str | None = None) -> argparse.ArgumentParser:
 
 
 def _check_options(words: list[str], known: list[str], command: str) -> None:
-    """Refuse a long option that is neither a command's nor the beginning of one (ConfigError).
-
-    Options after ``--`` and ``--ros-args`` are not the command's.
-    """
+    """Refuse a long option before ``--`` and ``--ros-args`` that does not begin one of the command's (ConfigError)."""
     for word in itertools.takewhile(lambda word: word not in ("--", "--ros-args"), words):
         option = word.partition("=")[0]
         if option.startswith("--") and not any(name.startswith(option) for name in known):

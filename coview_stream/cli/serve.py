@@ -191,11 +191,7 @@ def run(args: argparse.Namespace) -> int:
 
 
 def settings(args: argparse.Namespace) -> dict[str, dict[str, Any]]:
-    """Complete the arguments from ``--config`` and the defaults, and return the file's tables.
-
-    Raises:
-        ConfigError: the file has a mistake, or map or robots are missing in both.
-    """
+    """Complete the arguments from ``--config`` and the defaults; return the file's tables. ConfigError for errors."""
     tables: dict[str, dict[str, Any]] = {name: {} for name in TABLES}
     args.from_file, args.ros_node = set(), None
     declared = argparse.ArgumentParser()

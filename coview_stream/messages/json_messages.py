@@ -1,7 +1,4 @@
-"""JSON odometry, poses, statuses, hypotheses and locations.
-
-Reading is strict: every value is checked, a MessageError names the field; extra fields are ignored.
-"""
+"""JSON messages, read strictly: every value is checked, a MessageError names the field; extra fields are ignored."""
 
 from __future__ import annotations
 
@@ -76,10 +73,7 @@ def encode_pose(message: PoseMessage) -> Encoded:
 
 
 def pose_record(pose: PoseMessage, sample: Sample) -> dict[str, Any]:
-    """Return a pose's fields as in the native JSON, null where its format lacks one.
-
-    A JSON sample is returned unchanged, with any fields that a newer node added.
-    """
+    """Return a pose's fields as in native JSON, null where its format lacks one; a JSON sample returns unchanged."""
     if sample.payload[:1] == b"{":
         return read_object(sample.payload)
     return pose.to_json()

@@ -36,16 +36,10 @@ def encode_map(points: Points, stamp_ns: int) -> bytes:
 
 
 def encode_diagnostics(status: Mapping[str, Any], stamp_ns: int, transform: str, clock: str) -> bytes:
-    """Write a robot's status as a DiagnosticArray.
+    """Write a robot's status, as in ``out/status``, as a DiagnosticArray; MessageError if it is not a status.
 
-    Args:
-        status: document of ``out/status``.
-        stamp_ns: stamp of the header.
-        transform: state of map -> odom, for people.
-        clock: how message stamps contradict this node's clock, for people; empty if they agree.
-
-    Raises:
-        MessageError: the document is not a status.
+    For people, ``transform`` describes map -> odom, and ``clock`` how message stamps contradict this node's clock,
+    empty if they agree.
     """
     try:
         pose, node = status["pose"], status.get("node", {})

@@ -100,11 +100,7 @@ def _cdr_from_ros1(data: bytes, kind: str) -> bytes:
 
 
 def bounded(make: Callable[[], Any]) -> Callable[..., bytes]:
-    """Return a function that unpacks all frames of its argument, at most :data:`LIMIT` bytes (else ValueError).
-
-    Args:
-        make: returns a decompressor like bz2's: ``decompress(data, max_length)``, ``eof``, ``unused_data``.
-    """
+    """Return a function that unpacks with decompressors like bz2's, at most :data:`LIMIT` bytes (else ValueError)."""
 
     def decompress(data: bytes, _: int = 0) -> bytes:
         pieces: list[bytes] = []

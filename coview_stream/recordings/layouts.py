@@ -47,11 +47,7 @@ class Layout:
 
 
 def find_layout(path: Path) -> Layout:
-    """Find the files of the run at ``path``, a directory or a single cloud file.
-
-    Raises:
-        RunError: missing, of an unknown layout, or without frames; the message names the layouts.
-    """
+    """Find the files of a run, a directory or a cloud file; RunError if missing, of unknown layout, without frames."""
     if not path.exists():
         beside = [other.name for other in path.parent.iterdir()] if path.parent.is_dir() else []
         near = get_close_matches(path.name, beside, 1)
@@ -86,11 +82,7 @@ def is_run(path: Path) -> bool:
 
 
 def find_bag(path: Path) -> Path | None:
-    """Find the recording at ``path``: a file, or a rosbag2 directory; None for anything else.
-
-    Raises:
-        RunError: a directory holds several recordings but no ``metadata.yaml``.
-    """
+    """Find the recording at ``path``, a file or rosbag2 directory; else None. RunError for several without an index."""
     if not path.is_dir():
         return path if path.suffix in _BAGS and path.is_file() else None
     if (path / "frames").is_dir() or (path / "velodyne").is_dir():
@@ -125,11 +117,7 @@ def _frames(folder: Path) -> tuple[Path, ...]:
 
 
 def read_odometry(layout: Layout, explicit: Path | None = None) -> tuple[Floats, Poses]:
-    """Read stamps (N,) in seconds and poses (N, 4, 4), odometry <- body, one per frame.
-
-    Raises:
-        RunError: unreadable or invalid (file and line are named), or not one per frame.
-    """
+    """Read stamps (N,), seconds, and poses (N, 4, 4), odometry <- body; RunError if invalid or not one per frame."""
     file = explicit or layout.odometry
     assert file is not None
     if columns_of(file) == _KITTI_COLUMNS:
@@ -141,11 +129,7 @@ def read_odometry(layout: Layout, explicit: Path | None = None) -> tuple[Floats,
 
 
 def read_stamps(layout: Layout) -> Floats | None:
-    """Read stamps (N,) in seconds, one per frame, without the odometry; None if the run has none.
-
-    Raises:
-        RunError: unreadable or invalid (file and line are named), or not one per frame.
-    """
+    """Read stamps (N,), seconds, without odometry; None without any. RunError if invalid or not one per frame."""
     file, stamps = layout.times, None
     if file is not None:
         stamps = read_times(file)

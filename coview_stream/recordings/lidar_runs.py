@@ -1,7 +1,4 @@
-"""Runs with odometry computed from their clouds, and runs without odometry.
-
-Lidar odometry makes a first pass over the clouds; they are read again on use.
-"""
+"""Runs with odometry computed in a first pass over their clouds, and runs without odometry."""
 
 from __future__ import annotations
 
@@ -86,14 +83,7 @@ def _of_bag(
 def _place_all(
     path: Path, lidar: LidarOdometry, count: int, place: Callable[[int], Pose], progress: Progress | None = None
 ) -> tuple[list[int], Poses, list[str]]:
-    """Place ``count`` frames in order.
-
-    Returns:
-        Indices of the frames that could be placed, their poses (K, 4, 4), odometry <- body, and notes.
-
-    Raises:
-        RunError: none could be placed; the message ends with the first error.
-    """
+    """Place ``count`` frames; return their indices, poses (K, 4, 4) odometry <- body, and notes. RunError for none."""
     placed, poses, failed = [], [], []
     for index in range(count):
         try:

@@ -152,9 +152,7 @@ class RobotClient:
         return Received(self._statuses, timeout)
 
     def wait_for_node(self, seconds: float) -> bool:
-        """Wait until this robot's clouds have a subscriber; False if there is none after ``seconds``.
-
-        Samples sent earlier are lost.
+        """Wait until this robot's clouds have a subscriber (earlier samples are lost); False after ``seconds``.
 
         Raises:
             TransportError: the client is closed.

@@ -25,10 +25,7 @@ _ANSWERS = 8  # at once, one per reader: a stopped reader blocks a thread until 
 
 
 class MapServer:
-    """Serves one site: its manifest, and the layers in the present and the previous manifest; no other file.
-
-    Some threads answer queries; another watches the manifest for changes.
-    """
+    """Serves one site: its manifest, and the layers in the present and the previous manifest; no other file."""
 
     def __init__(
         self,

@@ -396,10 +396,7 @@ def work(
 
 
 def _set_group_nice(nice: int) -> None:
-    """Set the niceness of this process's session, where Linux groups tasks by session.
-
-    There a process's own niceness counts only within its session, and this process is alone in its session.
-    """
+    """Set the niceness of this session, where Linux groups tasks by session: a process's own counts only within."""
     with contextlib.suppress(OSError):
         Path("/proc/self/autogroup").write_text(str(nice))
 

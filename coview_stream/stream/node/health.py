@@ -122,11 +122,7 @@ class NodeHealth:
 
 
 def metrics_server(address: str, document: Callable[[], dict[str, Any]]) -> HttpServer:
-    """Return a server for ``/metrics`` (Prometheus) and ``/health`` (JSON; 200 if the node is ready, else 503).
-
-    Raises:
-        ConfigError: ``address`` is not ``HOST:PORT``, or cannot be bound.
-    """
+    """Return a server for ``/metrics`` (Prometheus) and ``/health`` (JSON); ConfigError if ``address`` is unusable."""
 
     def metrics(_: str) -> Reply:
         return Reply(prometheus_text(document()).encode(), "text/plain; version=0.0.4; charset=utf-8")
@@ -193,11 +189,7 @@ def _memory(pid: int) -> int | None:
 
 
 class Notifier:
-    """Sends notices to systemd; never waits and never fails.
-
-    Attributes:
-        watchdog_period: seconds between signs of life, half of systemd's limit; None if it wants none.
-    """
+    """Sends notices to systemd; never waits or fails. ``watchdog_period`` is half of its limit, seconds, or None."""
 
     def __init__(self, environment: Mapping[str, str] = os.environ) -> None:
         address = environment.get("NOTIFY_SOCKET", "")

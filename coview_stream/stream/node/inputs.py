@@ -179,10 +179,7 @@ class NewestStamp:
 
 
 class Inputs:
-    """Clouds and odometry of a robot that sends both, between two resets of its session.
-
-    ``codecs`` for clouds and odometry override the messages' own encodings.
-    """
+    """Clouds and odometry of a robot that sends both, between two resets; ``codecs`` override the messages' own."""
 
     odometry_source = "robot"  # or the library that computes odometry here
 

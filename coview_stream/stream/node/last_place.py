@@ -95,10 +95,7 @@ def save(folder: Path, robot: str, place: LastPlace) -> Path:
 
 
 def load(folder: Path, robot: str, map_sha256: str) -> LastPlace | None:
-    """Read a robot's file for a map; None if there is none.
-
-    Also None, after a warning that names the file, if it is damaged or of another version, robot or map.
-    """
+    """Read a robot's file for a map; None if missing or, with a warning, damaged or of other version, robot or map."""
     path = file_of(folder, robot, map_sha256)
     try:
         with _open_regular(path) as file:

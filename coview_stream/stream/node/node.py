@@ -143,11 +143,7 @@ class Node:
             self.transport.announce(robot.session.keys.alive)
 
     def close(self, timeout: float = _CLOSE_TIMEOUT) -> bool:
-        """Publish a last status, undeclare and end the engines; later calls only wait.
-
-        Returns:
-            Whether all is done; False after ``timeout`` seconds if the network blocks the thread that does it.
-        """
+        """Publish a last status, undeclare, end the engines; later calls only wait. False if not done in time."""
         if not self._stopping.is_set():
             self._stopping.set()
             self.reporter.changed.set()

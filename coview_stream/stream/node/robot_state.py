@@ -219,10 +219,7 @@ class OdomCorrection(NamedTuple):
 
 
 class StateHistory:
-    """The newest changes of a robot's reported state, with their reasons and evidence.
-
-    They are numbered from 1 since the session began: a gap in the numbers shows missing ones.
-    """
+    """The newest changes of a robot's reported state, numbered from 1 so that gaps show, with reasons and evidence."""
 
     def __init__(self) -> None:
         self._state = State.SEARCHING

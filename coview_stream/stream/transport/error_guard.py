@@ -28,12 +28,7 @@ class Caught:
 
 
 class RateLimitedErrors:
-    """Log of handler errors: the first of each kind at once, then at most one line per ``interval``.
-
-    Args:
-        interval: seconds between lines about the same place.
-        clock: monotonic, seconds.
-    """
+    """Log of handler errors: the first of each kind at once, then at most one line per ``interval``, seconds."""
 
     def __init__(
         self, logger: logging.Logger, interval: float = 10.0, clock: Callable[[], float] = time.monotonic

@@ -242,12 +242,7 @@ def _filled(template: str, values: dict[str, str], option: str, wildcards: bool 
 
 
 def check_disjoint(keys: Sequence[RobotKeys]) -> None:
-    """Check the keys of all robots of one node.
-
-    Raises:
-        ConfigError: a name occurs twice, two robots would read the same messages or write poses to one key, or a pose
-            would come back as input.
-    """
+    """Raise ConfigError if a name is given twice, robots share inputs or a pose key, or a pose returns as input."""
     names = [k.robot for k in keys]
     if len(set(names)) < len(names):
         raise ConfigError(f"--robot: {', '.join(names)}: each name once")

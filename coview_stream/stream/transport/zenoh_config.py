@@ -1,7 +1,4 @@
-"""Configuration of a zenoh session: the user's file first, our defaults for settings that it leaves out.
-
-zenoh's errors become one short line that ends with the remedy.
-"""
+"""Configuration of a zenoh session: the user's file, then our defaults; zenoh's errors as one line with a remedy."""
 
 from __future__ import annotations
 

@@ -236,10 +236,7 @@ class ZenohTransport:
         )
 
     def close(self) -> None:
-        """Undeclare everything and end the threads; takes well under a second, on a blocked link up to two.
-
-        Messages queued for the link get 0.3 s. Idempotent.
-        """
+        """Undeclare everything and end the threads in well under a second, up to two on a blocked link; idempotent."""
         with self._lock:
             if self._closing.is_set():
                 return
