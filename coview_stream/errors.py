@@ -27,7 +27,7 @@ def counted(count: int, noun: str) -> str:
 
 
 class CoViewWarning(UserWarning):
-    """Input that is used but may be a mistake. The message is one sentence, which the command prints as one line."""
+    """Input that is used but may be a mistake; the message is one sentence on one line."""
 
 
 class CoViewError(Exception):

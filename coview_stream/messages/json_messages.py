@@ -73,7 +73,7 @@ def encode_pose(message: PoseMessage) -> Encoded:
 
 
 def pose_record(pose: PoseMessage, sample: Sample) -> dict[str, Any]:
-    """Return a pose's fields as in native JSON, null where its format lacks one; a JSON sample returns unchanged."""
+    """Return a pose's fields as in native JSON, null where its format lacks one; a JSON sample stays as it is."""
     if sample.payload[:1] == b"{":
         return read_object(sample.payload)
     return pose.to_json()

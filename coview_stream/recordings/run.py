@@ -105,7 +105,7 @@ class Run:
     def __getitem__(self, index: slice) -> Run: ...
 
     def __getitem__(self, index: SupportsIndex | slice) -> Frame | Run:
-        """Read one frame, also from the end, or return the run of a slice; RunError if empty or going backwards."""
+        """Read one frame (negative: from the end), or return the run of a slice; RunError if empty or backwards."""
         if not isinstance(index, slice):
             at = operator.index(index)
             return self.read(at + len(self) if -len(self) <= at < 0 else at)

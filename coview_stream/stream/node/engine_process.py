@@ -396,7 +396,7 @@ def work(
 
 
 def _set_group_nice(nice: int) -> None:
-    """Set the niceness of this session, where Linux groups tasks by session: a process's own counts only within."""
+    """Set the niceness of this session, where Linux groups tasks by session: a process's own counts only in it."""
     with contextlib.suppress(OSError):
         Path("/proc/self/autogroup").write_text(str(nice))
 
