@@ -61,8 +61,7 @@ class Estimate(NamedTuple):
     """A pose and its covariance."""
 
     T_map_body: Pose  # (4, 4) float64
-    covariance: Floats
-    """(6, 6) over (rx, ry, rz, x, y, z): a rotation about the body, then a shift, along the map's axes."""
+    covariance: Floats  # (6, 6) over (rx, ry, rz, x, y, z): rotation about the body, then a shift, along the map's axes
 
     def innovation(self, T_map_body: Pose, covariance: Floats) -> float:
         """Squared Mahalanobis distance to a measured pose (4, 4), with the covariance of that measurement alone.

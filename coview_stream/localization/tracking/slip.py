@@ -58,7 +58,7 @@ class Dispute:
         """Return the right ``T_map_body`` (4, 4) if odometry has slipped; None while undecided.
 
         The candidates are the pose by odometry and the registered ones ``T_map_seen``; ``risk`` is the accepted
-        probability that another candidate is right that is too far off for both to be right.
+        probability that another candidate is right, too far off for both to be right.
         """
         if travelled - self._begun >= self._view:
             self._begun = travelled

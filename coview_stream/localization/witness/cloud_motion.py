@@ -44,7 +44,7 @@ APART = 2.0
 """Misfit above which clouds do not fit each other."""
 _STAYS = 0.06  # metres: three sigmas of a motion
 _NEAR_ZERO = 0.3  # metres and radians, largest motion of a copy
-_SAME = 0.05  # metres by which a lidar's noise moves a point of a copy at most
+_SAME = 0.05  # metres, largest shift of a copied point by a lidar's noise
 _UNKNOWN = 1e4  # variance of a motion that cannot be registered
 
 

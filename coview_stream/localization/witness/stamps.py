@@ -1,8 +1,8 @@
 """Stamps of clouds against the turns of the lidar, which are even also where the stamps are wrong.
 
 Clouds that become late have wider spaced stamps than the lidar's turns: by a hole where their lag jumps, by stretched
-intervals where it grows. So a step's stamps show how probable an increase of the lag is.
-The lidar's period is measured from the stamps: frames may be missing, so intervals are multiples of it.
+intervals where it grows. So a step's stamps show how probable an increase of the lag is. The lidar's period is measured
+from the stamps: frames may be missing, so intervals are multiples of it.
 """
 
 from __future__ import annotations
@@ -53,7 +53,7 @@ class StepStamps(NamedTuple):
         return longest - self.usual if longest > _BEYOND * self.usual else 0.0
 
     def stalled(self, lags: Floats) -> Floats:
-        """Return the shares (L,) of lags (L,) that started in a hole, which leave a usual interval of it."""
+        """Return the shares (L,) of lags (L,) that may start in a hole: without the lag it is a usual interval."""
         rest = float(self.seconds.max()) - lags
         likely = np.where(rest > _BEYOND * self.usual, 0.0, self._likelihood(rest, _BIN)) * (lags > 0.0)
         return likely / likely.sum() if self.hole and likely.any() else 0.0 * likely
