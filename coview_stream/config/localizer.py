@@ -100,7 +100,7 @@ class KeyframeConfig:
 
     Attributes:
         distance: metres driven between keyframes, the paper's sigma_d.
-        capacity: number of keyframes kept, which bounds memory.
+        capacity: keyframes kept, which bounds memory.
         voxel: metres; one point of a frame is kept per cube of this size.
         range_min: metres; nearer points are the robot itself.
         min_points: points left that a VLS needs to vote.
@@ -124,8 +124,8 @@ class ConsensusConfig:
     """Consensus: the votes of keyframes for one ``T_map_odom``; set by hand.
 
     Attributes:
-        window: number of newest keyframes that vote.
-        peaks: number of best hypotheses that the likelihood field scores; above 20,000 stations that of the co-view
+        window: newest keyframes that vote.
+        peaks: best hypotheses that the likelihood field scores; above 20,000 stations their number by the co-view
             descriptors grows by the fourth root.
         distinct_distance: metres; a hypothesis farther than this from all better ones is distinct.
         distinct_yaw: radians; so is one turned by more than this.
@@ -156,8 +156,8 @@ class LearnedConfig:
         reach: horizontal metres around the robot's newest position within which its keyframes' points are used.
         cell: spacing in metres of the places at which features are compared with the map's.
         dense_area: square metres up to which a whole map is searched.
-        shortlist: number of most similar tiles around which a larger map is searched.
-        peaks: number of best places that the likelihood field scores.
+        shortlist: most similar tiles around which a larger map is searched.
+        peaks: best places that the likelihood field scores.
     """
 
     reach: float = 30.0
