@@ -223,7 +223,7 @@ class Answers:
 def first_reply(
     session: Any, key: str, parameters: dict[str, str], timeout: float, max_bytes: int
 ) -> dict[str, Any] | None:
-    """Query ``key`` and return the first JSON reply, None after ``timeout`` seconds; TransportError if refused."""
+    """Query ``key``; return the first JSON reply, None after ``timeout`` s; TransportError for any other reply."""
     import zenoh
 
     for reply in session.get(zenoh.Selector(key, parameters), timeout=timeout):
