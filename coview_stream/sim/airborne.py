@@ -1,6 +1,6 @@
-"""Airborne scan for the base map: an aircraft that sweeps the scene in strips, in two directions.
+"""Airborne scan for the base map: an aircraft sweeps the scene in strips, in two directions.
 
-The figures follow data sheets of airborne scanners.
+The numbers follow data sheets of airborne scanners.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ ALTITUDE = 250.0
 """Metres above the scene's zero."""
 
 SWATH = float(np.radians(26.0))
-"""Half of the opening angle across the flight direction, radians."""
+"""Half the opening angle across the flight direction, radians."""
 
 RANGE_NOISE = 0.025
 """Metres, one sigma."""
@@ -38,8 +38,8 @@ class Flight:
     """Flight over the scene."""
 
     altitude: float = ALTITUDE  # metres above the scene's zero
-    swath: float = SWATH  # half of the opening angle across the flight direction, radians
-    noise: float = RANGE_NOISE  # of the range, metres, one sigma
+    swath: float = SWATH  # half the opening angle across the flight direction, radians
+    noise: float = RANGE_NOISE  # range noise, metres, one sigma
     porosity: float = POROSITY  # probability that a pulse passes one surface of foliage
     margin: float = 15.0  # metres beyond the map within which pulses aimed at the scene's zero are cast
 
@@ -52,9 +52,9 @@ def airborne_scan(
 ) -> Iterator[tuple[float, Floats]]:
     """Scan the square of ``size`` metres with ``density`` pulses per square metre, strip by strip.
 
-    Yields the share of the flight that is done (0 to 1) and the strip's points (N, 3) in the scene frame,
-    float64 metres. Two flight directions cross at 75 to 105 degrees with half of the pulses each:
-    facades of all headings are grazed.
+    Yields the completed share of the flight (0 to 1) and the strip's points (N, 3) in the scene frame, float64 metres.
+    Two flight directions with half of the pulses each cross at 75 to 105 degrees, so that facades of all headings are
+    grazed.
     """
     first = rng.uniform(0, np.pi)
     headings = (first, first + np.radians(rng.uniform(75, 105)))
@@ -64,7 +64,7 @@ def airborne_scan(
 
 
 def _lines(size: float, flight: Flight) -> Floats:
-    """Return offsets of the flight lines from the middle, metres: strips overlap and cover the corners."""
+    """Return offsets of the flight lines from the centre, metres; strips overlap and cover the corners."""
     reach, width = size / np.sqrt(2), 2 * flight.altitude * np.tan(flight.swath) * (1 - _OVERLAP)
     count = int(np.ceil(2 * reach / width))
     return np.asarray((np.arange(count) - (count - 1) / 2) * width)
@@ -96,7 +96,7 @@ def _strip(
         ray = np.column_stack([rng.normal(0, _FOOTPRINT, len(along)), tangent, np.full(len(along), -1.0)])
         ray /= np.linalg.norm(ray, axis=1)[:, None]
         origins, ray = origins @ turn, ray @ turn
-        # pulses whose target cannot be on the map are not worth casting
+        # skip pulses whose target cannot be on the map
         target = origins[:, :2] + ray[:, :2] / -ray[:, 2:] * flight.altitude
         near = (np.abs(target) < half + flight.margin).all(axis=1)
         origins, ray = origins[near], ray[near]
@@ -109,13 +109,13 @@ def _strip(
 
 
 _CROSSING = np.radians((75.0, 105.0))  # between the two flight directions
-_RETURNS, _DEAD = 4, 1.0  # of a pulse, and metres between two of them
-_RETURN_DEPTH = 0.3  # metres in depth that are one return
-_GRID, _NEIGHBOURS = 0.3, 16  # metres; places of that grid that say how the surface at a point lies
-_SCATTERED = 0.06  # least share of the spread across the surface where it is foliage
-_UPRIGHT = 0.35  # greatest |z| of the normal of a wall: from 70 degrees on
+_RETURNS, _DEAD = 4, 1.0  # most returns of a pulse, and metres between two of them
+_RETURN_DEPTH = 0.3  # metres of depth that merge into one return
+_GRID, _NEIGHBOURS = 0.3, 16  # metres; neighbours on that grid that determine the surface at a point
+_SCATTERED = 0.06  # least share of the spread across the surface in foliage
+_UPRIGHT = 0.35  # greatest |z| of a wall's normal: steeper than 70 degrees
 _TOP = 0.5  # metres: a wall's top edge
-_COLUMN = 1.0  # metres: points above a wall point within this belong to its wall
+_COLUMN = 1.0  # metres: points above a wall point within this distance belong to its wall
 _OPAQUE = 3.0  # width of a cell that a surface fills, in typical distances between neighbours
 
 
@@ -127,10 +127,10 @@ class Survey:
         ConfigError: a value out of its range.
     """
 
-    density: float = 8.0  # returns of first surfaces per square metre, where the ground survey has as many
-    swath: float = float(np.degrees(SWATH))  # half of the opening angle across the flight direction, degrees
+    density: float = 8.0  # first returns per square metre, where the ground survey is dense enough
+    swath: float = float(np.degrees(SWATH))  # half the opening angle across the flight direction, degrees
     altitude: float = ALTITUDE  # metres above the highest point
-    noise: float = RANGE_NOISE  # of the range, metres, one sigma
+    noise: float = RANGE_NOISE  # range noise, metres, one sigma
     porosity: float = POROSITY  # probability that a pulse passes a layer of foliage
     misaligned: float = 0.0  # shift of each strip, metres, one sigma per axis
     seed: int = 1  # of flight directions, pulses and noise
@@ -153,17 +153,17 @@ _DEFAULT = Survey()
 
 @dataclass(frozen=True)
 class Surface:
-    """How the surface lies at each point of a cloud."""
+    """Kind of surface at each point of a cloud."""
 
     foliage: Bools  # (N,) whether the neighbours are scattered and lie on no surface
-    wall: Bools  # (N,) whether it is a wall below its top edge
+    wall: Bools  # (N,) whether the point is on a wall below its top edge
     spacing: float  # typical distance to the nearest neighbour, metres
 
 
 def airborne_survey(points: Reals, survey: Survey = _DEFAULT) -> Floats:
-    """Return the points (M, 3) of a ground survey (N, 3) that an aircraft's lidar would meet, float64 metres.
+    """Return the points (M, 3) of a ground survey (N, 3) that an aircraft's lidar would hit, float64 metres.
 
-    Coordinates near zero, z up. Raises InputError for too few points to fit surfaces.
+    Coordinates are near zero, z up. InputError for too few points to fit surfaces.
     """
     places: Floats = points.astype(np.float64)
     rng, surface = np.random.default_rng(survey.seed), surface_of(places)
@@ -181,7 +181,7 @@ def airborne_survey(points: Reals, survey: Survey = _DEFAULT) -> Floats:
 
 
 def surface_of(points: Floats) -> Surface:
-    """Tell walls and foliage apart from other surfaces by the spread of each point's neighbours (N, 3)."""
+    """Find walls and foliage by the spread of the neighbours of each point (N, 3)."""
     grid = np.asarray(voxel_grid(points.astype(np.float32), _GRID), dtype=np.float64)
     if len(grid) < _NEIGHBOURS:
         raise InputError(f"a survey of {len(grid)} places {_GRID} m apart; give one of {_NEIGHBOURS} or more")
@@ -204,7 +204,7 @@ def surface_of(points: Floats) -> Surface:
 
 
 def _survey_lines(size: Floats, survey: Survey, rng: np.random.Generator) -> Iterator[tuple[Floats, float, float]]:
-    """Yield flight lines: the turn (2, 2) flight <- survey, metres from the middle, and the share of the density."""
+    """Yield flight lines: rotation (2, 2) flight <- survey, metres from the centre, and share of the density."""
     first = rng.uniform(0.0, np.pi)
     width = 2 * survey.altitude * np.tan(np.radians(survey.swath)) * (1 - _OVERLAP)
     for heading in (first, first + rng.uniform(*_CROSSING)):
@@ -216,17 +216,17 @@ def _survey_lines(size: Floats, survey: Survey, rng: np.random.Generator) -> Ite
 
 
 def _met(flown: Floats, surface: Surface, density: float, survey: Survey, rng: np.random.Generator) -> Indices:
-    """Return which points (N, 3), metres along, across and below the aircraft's line, give a return in its strip."""
+    """Return which points (N, 3), metres along, across and below the flight line, give a return in its strip."""
     swath, side = np.tan(np.radians(survey.swath)), 1.0 / np.sqrt(density)
     swept = np.flatnonzero(np.abs(flown[:, 1]) <= swath * flown[:, 2])
     depth = np.linalg.norm(flown[swept, 1:], axis=1)
-    # where the ray meets a plane below; points on one ray have one place there
+    # intersection of the ray with a plane below, the same for all points on one ray
     place = np.column_stack([flown[swept, 0], flown[swept, 1] / flown[swept, 2] * survey.altitude])
     opaque = max(_OPAQUE * surface.spacing, side)
     cell, count = _cells(place, opaque)
     solid, first = ~surface.foliage[swept], np.full(count, np.inf)
     np.minimum.at(first, cell[solid], depth[solid])
-    # a slope of 45 degrees is not hidden by its own upper end
+    # the upper end of a 45-degree slope does not hide the slope
     visible = np.flatnonzero(~surface.wall[swept] & (depth <= first[cell] + opaque + _RETURN_DEPTH))
     pulse, _ = _cells(place[visible], side)
     answering = _answers(pulse, depth[visible], surface.foliage[swept[visible]], survey.porosity, rng)
@@ -234,7 +234,7 @@ def _met(flown: Floats, surface: Surface, density: float, survey: Survey, rng: n
 
 
 def _answers(pulse: Indices, depth: Floats, foliage: Bools, porosity: float, rng: np.random.Generator) -> Indices:
-    """Return which of a strip's visible points (N,) answer their pulse (N,): one of each layer that it reaches."""
+    """Return which visible points (N,) of a strip return their pulse (N,): one in each layer that it reaches."""
     reach = np.full(int(pulse.max(initial=0)) + 1, -np.inf)
     alive = np.ones(len(reach), bool)
     returns: list[Indices] = []
@@ -253,7 +253,7 @@ def _answers(pulse: Indices, depth: Floats, foliage: Bools, porosity: float, rng
 
 
 def _cells(places: Floats, side: float) -> tuple[Indices, int]:
-    """Return the cell (N,) of each place (N, 2), metres, and how many cells there are."""
+    """Return the cell (N,) of each place (N, 2), metres, and the number of cells."""
     cell = np.floor((places - places.min(axis=0, initial=np.inf)) / side).astype(np.int64)
     columns = int(cell[:, 1].max(initial=0)) + 1
     return cell[:, 0] * columns + cell[:, 1], (int(cell[:, 0].max(initial=0)) + 1) * columns

@@ -1,6 +1,6 @@
-"""Buildings: each function draws one at the origin, frontage along x and the street towards -y.
+"""Buildings: each function draws one at the origin, with its frontage along x and the street towards -y.
 
-Walls reach ``_FOOTING`` below z = 0: a building may stand on a slope. Lengths in metres.
+Walls reach ``_FOOTING`` below z = 0, as a building may stand on a slope. Lengths in metres.
 """
 
 from __future__ import annotations
@@ -38,7 +38,7 @@ def _roof(rng: np.random.Generator, w: float, d: float, h: float) -> Mesh:
 
 
 def house(rng: np.random.Generator, w: float, d: float) -> Mesh:
-    """Draw a dwelling: pitched or flat roof; perhaps a chimney, bay, porch, balcony or dormer."""
+    """Draw a dwelling with a pitched or flat roof, and perhaps a chimney, bay, porch, balcony or dormer."""
     h = rng.choice([3.0, 5.8, 5.8, 8.6]) + rng.uniform(-0.3, 0.6)
     parts = [_walls(w, d, h)]
     if rng.random() < 0.2:
@@ -91,7 +91,7 @@ def _wing(rng: np.random.Generator, w: float, d: float, h: float) -> Mesh:
 
 
 def institute(rng: np.random.Generator, w: float, d: float) -> Mesh:
-    """Draw a large flat-roofed building: a slab, an L, a U or a court; a stair tower, canopy or arcade."""
+    """Draw a large flat-roofed building (slab, L, U or court) with a stair tower, canopy or arcade."""
     h = float(rng.integers(2, 7)) * 3.6
     wing = min(12.0, 0.4 * d)
     shape = rng.choice(["slab", "L", "U", "court"])
@@ -131,7 +131,7 @@ def hall(rng: np.random.Generator, w: float, d: float) -> Mesh:
 
 
 def passage(rng: np.random.Generator, w: float, d: float) -> Mesh:
-    """Draw a hall that a road leads through along x: gates at both ends; columns, racks and an office inside."""
+    """Draw a hall with a road through it along x, gates at both ends, and columns, racks and an office inside."""
     h, wall, gate, lintel = rng.uniform(5.5, 7.0), 0.3, 9.0, 4.6
     parts = [placed(box(w, wall, h + _FOOTING), 0, s * (d - wall) / 2, -_FOOTING) for s in (-1, 1)]
     jamb = (d - gate) / 2

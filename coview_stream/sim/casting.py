@@ -1,4 +1,4 @@
-"""First hits of rays on meshes: by Open3D (Embree) where that is installed, else by our own kernel, which is slower."""
+"""First hits of rays on meshes, by Open3D (Embree) if it is installed, else by our slower kernel."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ def open3d() -> ModuleType:
     """Import Open3D on first use (about a second), with its console output silenced.
 
     Raises:
-        DependencyError: Open3D or a system library of it is missing; the message names library and remedy.
+        DependencyError: Open3D or one of its system libraries is missing; the message names library and remedy.
     """
     try:
         try:
@@ -40,13 +40,13 @@ def open3d() -> ModuleType:
         except ImportError as error:
             if sys.platform != "linux" or "libusb" not in str(error):
                 raise
-            with contextlib.suppress(ImportError, OSError):  # the wheel's libusb, for the linker to find
+            with contextlib.suppress(ImportError, OSError):  # loads the wheel's libusb for the linker
                 library = importlib.import_module("libusb_package").get_library_path()
                 ctypes.CDLL(str(library), mode=ctypes.RTLD_GLOBAL)
             module = _import_open3d()
     except ImportError as error:
         raise DependencyError(_remedy(error)) from error
-    # Open3D prints warnings where this library raises errors
+    # Open3D prints warnings for errors that this library raises
     module.utility.set_verbosity_level(module.utility.VerbosityLevel.Error)
     return module
 
@@ -55,7 +55,7 @@ def _import_open3d() -> ModuleType:
     try:
         return importlib.import_module("open3d")
     except ImportError:
-        # a half-imported package would make the next attempt fail for another reason
+        # a half-imported package would fail the next attempt for another reason
         for name in [name for name in sys.modules if name == "open3d" or name.startswith("open3d.")]:
             del sys.modules[name]
         raise
@@ -85,7 +85,7 @@ class FirstHits(NamedTuple):
     mesh: Indices
     """(N,) index of the mesh; -1 without a hit."""
     normal: Floats32
-    """(N, 3) unit normals of the triangles as their corners turn; zeros without a hit."""
+    """(N, 3) unit normals of the triangles by the order of their corners; zeros without a hit."""
 
 
 Cast = Callable[[Floats32, Floats32], FirstHits]
@@ -93,7 +93,7 @@ Cast = Callable[[Floats32, Floats32], FirstHits]
 
 
 def caster_of(meshes: Sequence[Mesh], threads: int) -> Cast:
-    """Return a caster of rays on meshes, on ``threads`` cores; Open3D's if it can be loaded."""
+    """Return a ray caster for meshes, on ``threads`` cores, Open3D's if it can be loaded."""
     if not any(len(mesh.triangles) for mesh in meshes):
         return lambda origins, rays: _nothing(len(rays))
     library = _open3d_if_it_loads()
@@ -112,7 +112,7 @@ def _nothing(count: int) -> FirstHits:
 
 
 def open3d_caster(library: Any, meshes: Sequence[Mesh], threads: int) -> Cast:
-    """Return Open3D's caster of rays on meshes, of which one has a triangle or more."""
+    """Return Open3D's ray caster for meshes, at least one of which has triangles."""
     scene, tensor = library.t.geometry.RaycastingScene(nthreads=threads), library.core.Tensor
     numbers = [index for index, mesh in enumerate(meshes) if len(mesh.triangles)]
     for mesh in (meshes[index] for index in numbers):
@@ -122,7 +122,7 @@ def open3d_caster(library: Any, meshes: Sequence[Mesh], threads: int) -> Cast:
     def cast(origins: Floats32, rays: Floats32) -> FirstHits:
         packed = np.ascontiguousarray(np.concatenate([origins, rays], axis=1), dtype=np.float32)
         answer = scene.cast_rays(tensor(packed), nthreads=threads)
-        # a ray without a hit has a number beyond all; copies, as the arrays belong to the tensors of the answer
+        # a missed ray has a number beyond all meshes; copy, as the arrays belong to the tensors of the answer
         mesh = named[np.minimum(answer["geometry_ids"].numpy(), len(numbers))]
         return FirstHits(answer["t_hit"].numpy().copy(), mesh, answer["primitive_normals"].numpy().copy())
 
@@ -130,7 +130,7 @@ def open3d_caster(library: Any, meshes: Sequence[Mesh], threads: int) -> Cast:
 
 
 def kernel_caster(meshes: Sequence[Mesh]) -> Cast:
-    """Return our kernel's caster of rays on meshes, of which one has a triangle or more."""
+    """Return our kernel's ray caster for meshes, at least one of which has triangles."""
     first = np.cumsum([0, *(len(mesh.vertices) for mesh in meshes)])
     vertices = np.concatenate([mesh.vertices.astype(np.float32) for mesh in meshes])
     triangles = np.concatenate([mesh.triangles + begin for mesh, begin in zip(meshes, first[:-1], strict=True)])

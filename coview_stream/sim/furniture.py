@@ -9,15 +9,15 @@ from coview_stream.geometry.arrays import Floats
 from coview_stream.sim.layout import Layout, Site, directions
 from coview_stream.sim.mesh import Mesh, box, cylinder, frustum, join, placed
 
-_LORRIES = 0.95  # vehicles of this ``kind`` and above
-_SIGNS = (0.6, 0.85)  # poles of a ``kind`` between these carry a sign
+_LORRIES = 0.95  # least ``kind`` of a lorry
+_SIGNS = (0.6, 0.85)  # range of the ``kind`` of poles that carry a sign
 _MIN_CLEARANCE = 2.2  # metres from the robot's route to the middle of a vehicle
 
 
 def spots(rng: np.random.Generator, layout: Layout, spacing: float, offset: float) -> Floats:
     """Return places (N, 4) x, y, yaw, kind at ``offset`` metres from the streets' centre lines, in random order.
 
-    Places on a crossing are left out. ``kind`` is a random number in [0, 1).
+    Crossings have no places. ``kind`` is a random number in [0, 1).
     """
     tree = cKDTree(np.concatenate(layout.streets))
     rows = []
@@ -32,7 +32,7 @@ def spots(rng: np.random.Generator, layout: Layout, spacing: float, offset: floa
             rows.append(np.column_stack([xy, yaw, rng.random(len(k))]))
     places = np.concatenate(rows)
     clear = tree.query(places[:, :2])[0] > 0.8 * offset
-    # a parked vehicle, both its ends included, leaves the robot's lane free
+    # both ends of a parked vehicle leave the robot's lane free
     reach = np.where(places[:, 3] < _LORRIES, 2.7, 4.5)[:, None]
     along = reach * np.column_stack([np.cos(places[:, 2]), np.sin(places[:, 2])])
     ends = places[:, :2] + np.multiply.outer([-1.0, -0.5, 0.5, 1.0], along)
@@ -51,7 +51,7 @@ def poles(rows: Floats, site: Site) -> Mesh:
 
 
 def sign_plates(rows: Floats, site: Site) -> Mesh:
-    """Return the plates of the traffic signs among ``rows``, a little larger than :func:`poles` draws them."""
+    """Return the plates of the traffic signs among ``rows``, slightly larger than in :func:`poles`."""
     signs = rows[(rows[:, 3] >= _SIGNS[0]) & (rows[:, 3] < _SIGNS[1])]
     return join(_stand(placed(box(0.1, 0.74, 0.74), 0, 0, 1.98), site, x, y, yaw) for x, y, yaw, _ in signs)
 
@@ -61,7 +61,7 @@ def _stand(mesh: Mesh, site: Site, x: float, y: float, yaw: float) -> Mesh:
 
 
 def vehicle(kind: float) -> Mesh:
-    """Return a car, van or lorry at the origin, its front towards +x; ``kind`` is in [0, 1)."""
+    """Return a car, van or lorry at the origin with its front towards +x; ``kind`` is in [0, 1)."""
     scale = 0.9 + 0.25 * ((kind * 7.0) % 1.0)
     if kind < 0.75:
         body = placed(box(4.3 * scale, 1.75, 0.65), 0, 0, 0.25)
@@ -75,7 +75,7 @@ def vehicle(kind: float) -> Mesh:
 def _pole(kind: float) -> Mesh:
     tall = 4.5 + 4.0 * ((kind * 11.0) % 1.0)
     if kind < _SIGNS[0]:
-        # +y points at the road on the side where spots() puts things
+        # +y points to the road where spots() puts places
         arm = placed(box(0.12, 1.6, 0.12), 0, 0.8, tall - 0.2)
         return join([cylinder(0.1, tall, 6, top=0.06), arm])
     if kind < _SIGNS[1]:

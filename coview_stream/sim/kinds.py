@@ -1,6 +1,6 @@
 """Kinds of scene: streets, buildings and vegetation of towns, campuses, villages, industry, depots and forests.
 
-All numbers are plausible values, not measured ones.
+All numbers are plausible, not measured.
 """
 
 from __future__ import annotations
@@ -20,10 +20,10 @@ Range = tuple[float, float]
 class Plot(NamedTuple):
     """One type of building."""
 
-    draw: buildings.Draw  # function that draws one
-    weight: float  # how often it is chosen, relative to the others
-    frontage: Range  # range of its length along the street, metres
-    depth: Range  # range of its depth, metres
+    draw: buildings.Draw  # draws one building
+    weight: float  # relative frequency
+    frontage: Range  # length along the street, metres
+    depth: Range  # metres
 
 
 class Kind(NamedTuple):
@@ -31,7 +31,7 @@ class Kind(NamedTuple):
 
     streets: Callable[[np.random.Generator, float, float], Layout]  # (rng, size, half) -> layout
     relief: float  # amplitude of the hills
-    roughness: float  # amplitude of the ground off the road
+    roughness: float  # amplitude of bumps off the road
     ditch: float  # depth of the ditches along the roads
     plots: tuple[Plot, ...]  # buildings along the streets
     setback: Range  # range of the distance from the footway to a building
@@ -39,14 +39,14 @@ class Kind(NamedTuple):
     vacant: float  # share of the plots that stay empty
     infill: float  # density of buildings away from streets
     trees: float  # density
-    species: TreeMix  # their sizes and shapes
+    species: TreeMix  # sizes and shapes of the trees
     undergrowth: float = 0.0  # density of bushes
     rocks: float = 0.0  # density of boulders
     logs: float = 0.0  # density of fallen trunks
     cars: float = 0.0  # share of the parking places that are taken
     pole_spacing: float = 0.0  # mean distance between poles on one side of a street; 0 for none
     hedges: float = 0.0  # share of the plots with a hedge or fence in front
-    passage: tuple[float, float] = (0.0, 0.0)  # length and width of a hall that the robots' route leads through
+    passage: tuple[float, float] = (0.0, 0.0)  # length and width of a hall on the robots' route
 
 
 _HOUSE = Plot(buildings.house, 1.0, (8.0, 15.0), (8.0, 13.0))
@@ -143,4 +143,4 @@ KINDS: dict[str, Kind] = {
     ),
 }
 KINDS["depot"] = KINDS["industrial"]._replace(passage=(48.0, 22.0))
-"""Industry with a hall on the robots' route, whose inside the map has from a terrestrial scanner."""
+"""Industry with a hall on the robots' route; the map has the hall's inside from a terrestrial scanner."""

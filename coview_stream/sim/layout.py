@@ -1,4 +1,4 @@
-"""Layout of a scene: streets, the closed loop that the robot drives, the ground, and its occupied cells."""
+"""Layout of a scene: streets, the robot's closed route, the ground, and its occupied cells."""
 
 from __future__ import annotations
 
@@ -14,14 +14,14 @@ from coview_stream.sim.mesh import Mesh, height_field
 
 _LOOP_STEP = 0.25  # metres between points of the route
 _STREET_STEP = 1.0  # metres between points of a street
-_CELL = 0.5  # metres; finer than the narrowest gap that matters, between a pole and a kerb
+_CELL = 0.5  # metres; finer than the narrowest relevant gap, between a pole and a kerb
 
 
 @dataclass(frozen=True)
 class Layout:
     """Streets of a scene."""
 
-    route: Floats  # (N, 2) closed loop, metres, points _LOOP_STEP apart; it is one of the streets
+    route: Floats  # (N, 2) closed loop, metres, points _LOOP_STEP apart; one of the streets
     streets: tuple[Floats, ...]  # (K_i, 2) centre lines, metres, points a metre apart
     half_width: float  # metres from the centre line to the edge of the carriageway
 
@@ -35,12 +35,12 @@ def resample(points: Floats, step: float) -> Floats:
 
 
 def arc_lengths(points: Floats) -> Floats:
-    """Return (N,) metres along a polyline (N, 2)."""
+    """Return the metres (N,) along a polyline (N, 2)."""
     return np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(points, axis=0).T))])
 
 
 def directions(points: Floats) -> Floats:
-    """Return (N,) headings of a polyline (N, 2), radians."""
+    """Return the headings (N,) of a polyline (N, 2), radians."""
     tangent = np.gradient(points, axis=0)
     return np.asarray(np.arctan2(tangent[:, 1], tangent[:, 0]))
 
@@ -48,7 +48,7 @@ def directions(points: Floats) -> Floats:
 def grid_layout(
     rng: np.random.Generator, size: float, half: float, spacing: tuple[float, float], half_width: float, bend: float
 ) -> Layout:
-    """Return blocks between crossing streets; the loop goes round some. Streets curve by ``bend`` metres."""
+    """Return blocks between crossing streets, some inside the loop; streets curve by ``bend`` metres."""
     yaw = rng.uniform(0, np.pi / 2)
     xs, x0, x1 = _loop_lines(_street_lines(rng, half, spacing), size)
     ys, y0, y1 = _loop_lines(_street_lines(rng, half, spacing), size)
@@ -74,7 +74,7 @@ def grid_layout(
 def loop_layout(
     rng: np.random.Generator, size: float, half: float, half_width: float, branches: int, waviness: float
 ) -> Layout:
-    """Return a winding loop with side roads that leave it outwards, and one path across its middle."""
+    """Return a winding loop with side roads outwards, and one path across its middle."""
     angle = np.linspace(0, 2 * np.pi, 1500)
     radius = np.ones_like(angle)
     for k in (2, 3, 4):
@@ -103,9 +103,9 @@ def _street_lines(rng: np.random.Generator, half: float, spacing: tuple[float, f
 
 
 def _loop_lines(lines: Floats, size: float) -> tuple[Floats, float, float]:
-    """Pick the two street lines that bound the loop; return all lines and those two.
+    """Choose the two street lines that bound the loop; return all lines and these two.
 
-    The two lie nearest to a quarter of the map's size on either side of its middle, moved where they would leave the
+    They are the nearest to a quarter of the map's size on either side of its centre, moved if they would leave the
     map; streets that then run too close to them are dropped.
     """
     near, far = 0.14 * size, 0.28 * size
@@ -134,8 +134,8 @@ def _inside(points: Floats, half: float) -> Floats:
 class Site:
     """Ground of a scene, a square of +-``half`` metres about the origin, with its occupied cells.
 
-    ``relief`` is the amplitude of the hills, ``roughness`` of the ground off the road, ``ditch`` the
-    depth of the ditches along it; metres.
+    ``relief`` and ``roughness`` are the amplitudes of the hills and of bumps off the road, ``ditch`` is the depth of
+    the ditches along roads; metres.
     """
 
     def __init__(
@@ -148,7 +148,7 @@ class Site:
         for line in (layout.route, *layout.streets):
             i, j = np.clip(((line + half) / _CELL).astype(np.intp), 0, n - 1).T
             centre[i, j] = False
-        # each cell's distance to a street's centre, metres, and the occupied cells: at first the streets
+        # distance of each cell to a street's centre, metres, and the occupied cells, at first the streets
         self._road: Floats32 = (distance_transform_edt(centre) * _CELL).astype(np.float32)
         self._taken: Bools = self._road < layout.half_width
         step = max(1.0, half / 180.0)
@@ -165,13 +165,13 @@ class Site:
         self._heights: Floats = z - ditch * np.exp(-(((off_road - 1.5) / 0.9) ** 2))
 
     def z(self, x: npt.ArrayLike, y: npt.ArrayLike) -> Floats:
-        """Return the height of the ground at (N,) coordinates, metres."""
+        """Return the ground height at coordinates (N,), metres."""
         scale = (len(self._axis) - 1) / (2 * self.half)
         at = (np.stack(np.broadcast_arrays(np.atleast_1d(x), np.atleast_1d(y))) + self.half) * scale
         return np.asarray(map_coordinates(self._heights, at, order=1, mode="nearest"))
 
     def height(self, x: float, y: float) -> float:
-        """Return the height of the ground at one place, metres."""
+        """Return the ground height at one place, metres."""
         return float(self.z(x, y)[0])
 
     def mesh(self, cover: Callable[[Floats, Floats], Floats] | None = None) -> Mesh:
@@ -182,12 +182,12 @@ class Site:
         return height_field(self._axis, self._heights + cover(X.ravel(), Y.ravel()).reshape(X.shape))
 
     def road_distance(self, x: Floats, y: Floats) -> Floats:
-        """Return (N,) metres to the nearest street's centre line."""
+        """Return the metres (N,) to the nearest street's centre line."""
         i, j = self._cells(x, y)
         return self._road[i, j].astype(np.float64)
 
     def claim(self, x: float, y: float, w: float, d: float, yaw: float = 0.0, margin: float = 0.0) -> bool:
-        """Occupy a w x d rectangle if it and ``margin`` metres about it are free of roads and other claims."""
+        """Occupy a w x d rectangle if it and ``margin`` metres around are free of roads and other claims."""
         wide = self._footprint(x, y, w + 2 * margin, d + 2 * margin, yaw)
         if np.abs(wide).max() >= self.half or self._taken[self._cells(*wide.T)].any():
             return False

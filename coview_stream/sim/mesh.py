@@ -1,6 +1,6 @@
 """Triangle meshes of simple solids, as arrays.
 
-Every solid stands on z = 0 around the origin, in metres; :func:`placed` turns and moves it.
+Every solid stands on z = 0 around the origin, in metres; :func:`placed` rotates and moves it.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ _BOX = np.array(
 
 
 def join(meshes: Iterable[Mesh]) -> Mesh:
-    """Return one mesh of many."""
+    """Join meshes."""
     parts = list(meshes)
     if not parts:
         return EMPTY
@@ -42,7 +42,7 @@ def join(meshes: Iterable[Mesh]) -> Mesh:
 
 
 def placed(mesh: Mesh, x: float, y: float, z: float = 0.0, yaw: float = 0.0) -> Mesh:
-    """Turn a mesh about z by ``yaw`` radians, then move it."""
+    """Rotate a mesh about z by ``yaw`` radians, then move it."""
     c, s = np.cos(yaw), np.sin(yaw)
     v = mesh.vertices
     moved = np.column_stack([c * v[:, 0] - s * v[:, 1] + x, s * v[:, 0] + c * v[:, 1] + y, v[:, 2] + z])
@@ -50,12 +50,12 @@ def placed(mesh: Mesh, x: float, y: float, z: float = 0.0, yaw: float = 0.0) -> 
 
 
 def prism(bottom: Floats, top: Floats) -> Mesh:
-    """Return the solid between two quadrilaterals (4, 3) with corners in the same, counter-clockwise, order."""
+    """Return the solid between two quadrilaterals (4, 3) with corners in the same counter-clockwise order."""
     return Mesh(np.concatenate([bottom, top]), _BOX)
 
 
 def rectangle(w: float, d: float, z: float) -> Floats:
-    """Return (4, 3) corners of a w x d rectangle at height ``z``, counter-clockwise."""
+    """Return the corners (4, 3), counter-clockwise, of a w x d rectangle at height ``z``."""
     return np.array([[-w, -d, 2 * z], [w, -d, 2 * z], [w, d, 2 * z], [-w, d, 2 * z]]) / 2.0
 
 
@@ -65,7 +65,7 @@ def box(w: float, d: float, h: float) -> Mesh:
 
 
 def frustum(w: float, d: float, h: float, top_w: float, top_d: float) -> Mesh:
-    """Return a box whose top is smaller than its base: hipped roofs, bonnets, woodpiles."""
+    """Return a box with a smaller top than base, for hipped roofs, bonnets and woodpiles."""
     return prism(rectangle(w, d, 0.0), rectangle(top_w, top_d, h))
 
 
@@ -78,14 +78,14 @@ def gable(w: float, d: float, rise: float) -> Mesh:
 
 
 def shed(w: float, d: float, rise: float) -> Mesh:
-    """Return a single-pitch roof that rises towards +y: one tooth of a saw-tooth roof."""
+    """Return a single-pitch roof that rises towards +y, one tooth of a saw-tooth roof."""
     top = rectangle(w, d, 0.02)
     top[2:, 2] = rise
     return prism(rectangle(w, d, 0.0), top)
 
 
 def cylinder(radius: float, h: float, sides: int = 10, top: float | None = None) -> Mesh:
-    """Return an upright cylinder, or cone frustum where ``top`` is another radius; closed above, open below."""
+    """Return an upright cylinder, or a cone frustum with the radius ``top``; closed above, open below."""
     angle = np.arange(sides) * 2 * np.pi / sides
     ring = np.column_stack([np.cos(angle), np.sin(angle)])
     low = np.column_stack([ring * radius, np.zeros(sides)])
@@ -99,7 +99,7 @@ def cylinder(radius: float, h: float, sides: int = 10, top: float | None = None)
 
 
 def ellipsoid(rings: int = 5, sides: int = 8) -> Mesh:
-    """Return a coarse unit sphere about the origin: the template of crowns and bushes."""
+    """Return a coarse unit sphere about the origin, the template of crowns and bushes."""
     polar = np.pi * np.arange(1, rings) / rings
     angle = np.arange(sides) * 2 * np.pi / sides
     P, A = np.meshgrid(polar, angle, indexing="ij")
@@ -118,7 +118,7 @@ def ellipsoid(rings: int = 5, sides: int = 8) -> Mesh:
 
 
 def copies(template: Mesh, vertices: Floats) -> Mesh:
-    """Return one mesh of many deformed templates; ``vertices`` is (copies, V, 3)."""
+    """Return one mesh of deformed copies of a template; ``vertices`` is (copies, V, 3)."""
     count, size = vertices.shape[0], vertices.shape[1]
     offsets = (np.arange(count) * size)[:, None, None]
     return Mesh(vertices.reshape(-1, 3), (template.triangles[None] + offsets).reshape(-1, 3))

@@ -1,7 +1,7 @@
 """Motion of a simulated robot: true poses along the route, and odometry that drifts from them.
 
-The robot keeps a steady speed and sways on uneven ground. Its odometry has an origin and heading of its own and is
-gravity aligned.
+The robot drives at constant speed and sways on uneven ground. Its odometry has its own origin and heading, and is
+aligned to gravity.
 """
 
 from __future__ import annotations
@@ -18,9 +18,9 @@ from coview_stream.sim.layout import arc_lengths, directions
 from coview_stream.sim.scenes import Scene
 from coview_stream.sim.sensors import FRAME_PERIOD
 
-_SWAY = float(np.radians(0.6))  # radians; roll and pitch jitter, one sigma
-_SWAY_MEMORY = 0.8  # share of the frame before; a body on wheels swings at about 1 Hz
-_WANDER = 0.25  # metres, about the middle of the lane
+_SWAY = float(np.radians(0.6))  # jitter of roll and pitch, radians, one sigma
+_SWAY_MEMORY = 0.8  # share that persists from frame to frame; a body on wheels swings at about 1 Hz
+_WANDER = 0.25  # metres around the middle of the lane
 _WHEELBASE = 1.0  # metres over which the ground tilts the robot
 
 
@@ -34,11 +34,11 @@ class OdometryConfig:
 
     # random walk of the heading, radians per square root of a metre driven, one sigma
     yaw_walk: float = float(np.radians(0.15))
-    scale_error: float = 0.008  # constant error of the scale over the run, one sigma
+    scale_error: float = 0.008  # constant scale error of a run, one sigma
     position_walk: float = 0.004  # random walk of the position, metres per square root of a metre, one sigma
-    # error of roll and pitch, radians, one sigma, independent from frame to frame
+    # error of roll and pitch, radians, one sigma, independent between frames
     tilt_noise: float = float(np.radians(0.05))
-    offset: float = 400.0  # the odometry starts within +- this of its origin, metres (a tenth of it in z)
+    offset: float = 400.0  # greatest distance of the start from the odometry's origin, metres (a tenth in z)
 
     def __post_init__(self) -> None:
         within(self, **{field.name: (0.0, 1e5 if field.name == "offset" else 1.0) for field in fields(self)})
@@ -49,8 +49,8 @@ def drive(
 ) -> Floats:
     """Return poses (N, 4, 4) of the sensor in the scene, one every ``period`` seconds over ``length`` metres.
 
-    Start and direction on the route are drawn; a long drive goes round again. The sensor is ``height``
-    metres above the ground, and pitches and rolls with it.
+    Start and direction on the route are drawn; a long drive repeats the loop. The sensor is ``height`` metres above
+    the ground, and pitches and rolls with it.
     """
     route = scene.route if rng.random() < 0.5 else scene.route[::-1]
     arc = arc_lengths(route)
@@ -60,7 +60,7 @@ def drive(
     sideways = _WANDER * np.sin(2 * np.pi * at / rng.uniform(25, 45) + rng.uniform(0, 2 * np.pi))
     x = np.interp(at, arc, route[:, 0]) - sideways * np.sin(heading)
     y = np.interp(at, arc, route[:, 1]) + sideways * np.cos(heading)
-    # roll and pitch of the ground under the wheels, and sway
+    # roll and pitch from the ground under the wheels, and sway
     cx, cy = np.cos(heading) * _WHEELBASE / 2, np.sin(heading) * _WHEELBASE / 2
     ahead = scene.site.z(x + cx, y + cy) - scene.site.z(x - cx, y - cy)
     left = scene.site.z(x - cy, y + cx) - scene.site.z(x + cy, y - cx)
@@ -79,7 +79,7 @@ def drive(
 def drifting_odometry(T_map_body: Floats, config: OdometryConfig, rng: np.random.Generator) -> Floats:
     """Return odometry ``T_odom_body`` (N, 4, 4) of a robot with true poses ``T_map_body`` (N, 4, 4).
 
-    The frames differ by a turn about z and an offset; both are aligned to gravity.
+    The two frames differ by a rotation about z and an offset; both are aligned to gravity.
     """
     count = len(T_map_body)
     steps = np.diff(T_map_body[:, :3, 3], axis=0)
@@ -93,7 +93,7 @@ def drifting_odometry(T_map_body: Floats, config: OdometryConfig, rng: np.random
     turns = np.stack([rot_z(angle) for angle in yaw])
     moved = np.einsum("nij,nj->ni", turns[:-1], steps) * scale + noise
     T_odom_body = np.tile(np.eye(4), (count, 1, 1))
-    # too small for the order of roll and pitch to matter
+    # so small that the order of roll and pitch does not matter
     tilted = Rotation.from_rotvec(np.column_stack([tilts, np.zeros(count)])).as_matrix()
     T_odom_body[:, :3, :3] = turns @ T_map_body[:, :3, :3] @ tilted
     T_odom_body[:, :3, 3] = origin + np.concatenate([np.zeros((1, 3)), np.cumsum(moved, axis=0)])

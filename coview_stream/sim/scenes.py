@@ -1,6 +1,6 @@
 """Seeded scenes in two states: when the map was made, and now.
 
-Scene frame: z up, metres, origin in the middle. Trees, cars and poles may change between the two;
+The scene frame has z up, metres, and its origin at the centre. Trees, cars and poles may change between the states;
 ground, buildings and hedges stay.
 """
 
@@ -19,11 +19,11 @@ from coview_stream.sim.layout import Site, directions, resample
 from coview_stream.sim.mesh import Mesh, join, placed
 
 # metres
-_MARGIN = 50.0  # of the scene beyond the map: a robot near the edge sees it
+_MARGIN = 50.0  # of the scene beyond the map, seen by a robot near the edge
 _FOOTWAY = 1.8  # width
 _PARKING = 6.4  # length of a parking place
 
-# one random stream per purpose: a change of one leaves the others as they are
+# one random stream per purpose, so that changes of one leave the others unchanged
 _GROUND, _BUILT, _GREEN, _STREET, _SPARE = range(5)
 
 
@@ -40,7 +40,7 @@ class Footprint:
     top: float  # height of the ridge
 
     def holds(self, xy: Floats, margin: float = 0.0) -> Bools:
-        """Tell which of (N, 2) places lie inside or within ``margin`` metres of it."""
+        """Mask the places (N, 2) inside the footprint or within ``margin`` metres of it."""
         c, s = np.cos(self.yaw), np.sin(self.yaw)
         across = np.abs((xy - (self.x, self.y)) @ np.array([[c, -s], [s, c]]))
         return np.asarray((across < (self.w / 2 + margin, self.d / 2 + margin)).all(axis=1))
@@ -48,7 +48,7 @@ class Footprint:
 
 @dataclass(frozen=True)
 class SceneState:
-    """Scene at one time: solid surfaces stop every ray, foliage lets some rays pass."""
+    """Scene at one time; solid surfaces stop every ray, foliage lets some rays pass."""
 
     solid: Mesh
     foliage: Mesh
@@ -63,11 +63,11 @@ class Parts:
     fixed: tuple[Mesh, ...]  # boulders and fallen trunks
     bushes: tuple[Mesh, ...]  # leafy undergrowth
     trees: Floats  # rows of vegetation.TREE_COLUMNS
-    cars: Floats  # rows of parked vehicles, as furniture.cars takes them
-    poles: Floats  # rows of poles, as furniture.poles takes them
+    cars: Floats  # rows of parked vehicles for furniture.cars
+    poles: Floats  # rows of poles for furniture.poles
 
     def state(self, site: Site) -> SceneState:
-        """Join the solid parts, and the leafy ones."""
+        """Join the solid parts, and the leafy parts."""
         below = site.z(self.trees[:, 0], self.trees[:, 1])
         street = [furniture.cars(self.cars, site), furniture.poles(self.poles, site)]
         solid = join([self.ground, *self.built, *self.fixed, *street, vegetation.trunks(self.trees, below)])
@@ -79,36 +79,36 @@ class Scene:
     """Scene in both states."""
 
     kind: str  # one of KINDS
-    size: float  # side of the square that the map covers, metres
+    size: float  # side of the map's square, metres
     mapped: SceneState  # the scene as the aircraft saw it
     now: SceneState  # the scene as the robot sees it
     site: Site  # ground and roads
     route: Floats  # (N, 2) closed loop that robots drive on, metres
     footprints: tuple[Footprint, ...]  # of the buildings
-    # its parts when the map was made and now; None for a scene not drawn by e
+    # parts when the map was made and now; None for a scene not drawn by build_scene
     parts: tuple[Parts, Parts] | None = None
-    houses: tuple[int, ...] = ()  # for each footprint the index of its building among Parts.built
-    passage: Footprint | None = None  # the hall that the route leads through
+    houses: tuple[int, ...] = ()  # index of each footprint's building in Parts.built
+    passage: Footprint | None = None  # hall on the route
 
 
 @dataclass(frozen=True)
 class _Movable:
-    """Objects of one sort: ``rows`` when the map was made, and ``spares`` that replace some of them now."""
+    """Objects of one kind: ``rows`` when the map was made, and ``spares`` that replace some of them now."""
 
     rows: Floats
     spares: Floats
 
     def now(self, rng: np.random.Generator, changed: float) -> Floats:
-        """Return the rows with a share of them replaced by spares."""
+        """Return the rows, a share of them replaced by spares."""
         count = round(changed * len(self.rows))
         keep = np.sort(rng.permutation(len(self.rows))[count:])
         return np.concatenate([self.rows[keep], self.spares[:count]])
 
 
 def build_scene(kind: str, seed: int, size: float = 240.0, changed: float = 0.0) -> Scene:
-    """Draw a scene of ``size`` metres; the share ``changed`` of the trees, cars and poles is replaced now.
+    """Draw a scene of ``size`` metres in which the share ``changed`` of the trees, cars and poles is replaced now.
 
-    Scenes that differ in ``changed`` only have the same map.
+    Scenes that differ only in ``changed`` have the same map.
 
     Raises:
         ConfigError: unknown kind.
@@ -144,7 +144,7 @@ def build_scene(kind: str, seed: int, size: float = 240.0, changed: float = 0.0)
 
 
 def _passage(rng: np.random.Generator, site: Site, spec: Kind) -> tuple[Footprint, Mesh]:
-    """Put a hall over the straightest part of the route; on a small site it is shorter."""
+    """Put a hall over the straightest part of the route, a shorter hall on a small site."""
     route, (w, d) = site.layout.route, spec.passage
     w = min(w, 0.44 * (site.half - _MARGIN))
     heading, step = np.unwrap(directions(route)), float(np.linalg.norm(route[1] - route[0]))
@@ -193,7 +193,7 @@ def _line_street(
     build: Callable[[Plot, float, float, float, float, float, float], bool],
     meshes: list[Mesh],
 ) -> None:
-    """Fill one side of a street with plots: a building and perhaps a hedge or fence in front."""
+    """Fill one side of a street with plots, each a building and perhaps a hedge or fence in front."""
     heading = directions(line)
     kerb = site.layout.half_width + _FOOTWAY
     at = rng.uniform(0.0, 10.0)
@@ -215,7 +215,7 @@ def _line_street(
 
 
 def _enclosure(rng: np.random.Generator, site: Site, start: Floats, end: Floats) -> Mesh:
-    """Draw a hedge, wall or fence with a gate, left out where it would cross a road."""
+    """Draw a hedge, wall or fence with a gate; none if it would come too close to a road."""
     line = resample(np.array([start, end]), 2.0)
     if site.road_distance(*line.T).min() < site.layout.half_width + 0.8 or np.abs(line).max() >= site.half:
         return join([])

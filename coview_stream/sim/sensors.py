@@ -1,7 +1,7 @@
 """Lidars of robots: beam directions, range, noise and lost pulses.
 
-Sensor frame: x forward, y left, z up. A frame is 0.1 s, or the scan of a terrestrial scanner, which a robot stands
-for. Figures are set by hand, after the sensors' data sheets.
+The sensor frame is x forward, y left, z up. A frame takes 0.1 s, or is the scan of a terrestrial scanner, for which the
+robot stops. Numbers are set by hand, after the sensors' data sheets.
 """
 
 from __future__ import annotations
@@ -21,28 +21,28 @@ from coview_stream.sim.mesh import Mesh
 from coview_stream.sim.scenes import SceneState
 
 BLOCK = 200_000
-"""Rays cast at a time: bounds the memory to about 30 MB."""
+"""Rays cast at a time, which bounds memory to about 30 MB."""
 
 _THREADS = 2
 _MAX_LAYERS = 6  # surfaces of foliage that a ray may pass
-_LEAF_DEPTH = 0.12  # metres; mean depth below the hull of a crown at which a leaf is hit
-_STEP = 2e-3  # metres beyond a leaf at which the ray goes on
+_LEAF_DEPTH = 0.12  # metres; mean depth below a crown's hull at which a leaf is hit
+_STEP = 2e-3  # metres beyond a leaf at which the ray continues
 
 
 class Hits(NamedTuple):
     """First hits of (N,) rays."""
 
     distance: Floats32  # (N,) metres; inf without a hit
-    incidence: Floats32  # (N,) absolute cosines of the angles of incidence; 1 on foliage
+    incidence: Floats32  # (N,) absolute cosine of the angle of incidence; 1 on foliage
     mesh: Indices  # (N,) index of the mesh; -1 without a hit
-    normal: Floats32  # (N, 3) unit normals of the surfaces, on either side
+    normal: Floats32  # (N, 3) unit normals of the surfaces, of either sign
 
 
 class MeshCaster:
     """Ray caster for meshes, on ``threads`` cores.
 
     ``foliage`` maps the index of a mesh to the probability that a ray passes one of its surfaces, None for the
-    ``porosity`` of :meth:`trace`; leaves are hit ``leaf_depth`` metres on average below the surface.
+    ``porosity`` of :meth:`trace`; leaves are hit ``leaf_depth`` metres below the surface on average.
     """
 
     def __init__(
@@ -56,7 +56,7 @@ class MeshCaster:
         self._foliage = dict(foliage)
 
     def trace(self, origins: Floats32, rays: Floats32, rng: np.random.Generator, porosity: float) -> Hits:
-        """Return the first hits of (N, 3) unit rays from (N, 3) origins, scene frame, metres."""
+        """Return the first hits of unit rays (N, 3) from origins (N, 3), scene frame, metres."""
         parts = [
             self._trace_block(origins[i : i + BLOCK], rays[i : i + BLOCK], rng, porosity)
             for i in range(0, len(rays), BLOCK)
@@ -102,7 +102,7 @@ class Caster(MeshCaster):
 
 
 FRAME_PERIOD = 0.1
-"""Seconds from frame to frame, but of a robot that stops to scan."""
+"""Seconds between frames, except for a robot that stops to scan."""
 
 RANGE_NOISE = 0.02
 """Metres, one sigma."""
@@ -121,8 +121,8 @@ class Sensor:
     beams: Callable[[int], Floats]  # frame number -> (N, 3) unit directions in the sensor frame
     min_range: float  # metres; nearer returns are dropped
     max_range: float  # metres, at perpendicular incidence
-    stop: float = 0.0  # metres from scan to scan of a robot that stands while it scans; 0: it scans as it drives
-    stand: float = 0.0  # seconds that it stands
+    stop: float = 0.0  # metres between the scans of a robot that stops to scan; 0: it scans while driving
+    stand: float = 0.0  # seconds of each stop
 
     def scan(
         self,
@@ -134,7 +134,7 @@ class Sensor:
         porosity: float = POROSITY,
         noise: float = RANGE_NOISE,
     ) -> Points:
-        """Return one deskewed frame (N, 3) in the sensor frame, float32 metres; ``noise`` is the range's."""
+        """Return one deskewed frame (N, 3) in the sensor frame, float32 metres, with range ``noise``."""
         rays = self.beams(frame)
         origins = np.broadcast_to(T_scene_body[:3, 3].astype(np.float32), rays.shape)
         turned = (rays @ T_scene_body[:3, :3].T).astype(np.float32)
@@ -145,9 +145,9 @@ class Sensor:
         return (rays[detected] * noisy[detected, None]).astype(np.float32)
 
     def detects(self, distance: Floats, strength: Reals, luck: Floats) -> Bools:
-        """Tell which of (N,) pulses return, from (N,) distances in metres.
+        """Mask the pulses (N,) that return from distances (N,) in metres.
 
-        ``strength`` is the cosine of the incidence, less losses on the way; ``luck`` is uniform in [0, 1).
+        ``strength`` is the cosine of the incidence, reduced by losses; ``luck`` is uniform in [0, 1).
         """
         with np.errstate(invalid="ignore"):
             # a Lambertian surface returns cos / r^2; below the threshold a pulse is lost more and more often
@@ -162,7 +162,7 @@ def _spherical(azimuth: Floats, elevation: Floats) -> Floats:
 
 
 def _spinning(elevations: npt.ArrayLike, offsets: Floats, columns: int) -> Callable[[int], Floats]:
-    """Return the beams of all columns, clockwise as seen from above; each leads or lags by its ``offsets``, radians."""
+    """Return the beams of all columns, clockwise seen from above; each leads or lags by its ``offsets``, radians."""
     azimuth = -np.arange(columns)[:, None] * 2 * np.pi / columns + offsets[None]
     elevation = np.broadcast_to(np.asarray(elevations, dtype=np.float64), azimuth.shape)
     rays = _spherical(azimuth.ravel(), elevation.ravel())
@@ -178,14 +178,14 @@ def _vlp16() -> Sensor:
 
 
 INCLINATION = float(np.radians(45.0))
-"""Of the axis of the rotating VLP-16, radians."""
+"""Inclination of the axis of the rotating VLP-16, radians."""
 
 TURNS = 0.5
-"""Turns of the whole sensor about the vertical, per second."""
+"""Rotations of the whole sensor about the vertical, per second."""
 
 
 def _inclined() -> Sensor:
-    """Return FGLoc6D's VLP-16: inclined, and turning about the vertical as a whole. Its frames do not turn with it."""
+    """Return FGLoc6D's inclined VLP-16, which rotates about the vertical; its frames do not rotate with it."""
     upright = _vlp16()
     rays, c, s = upright.beams(0), np.cos(INCLINATION), np.sin(INCLINATION)
     x, y, z = (rays @ np.array([[1, 0, 0], [0, c, s], [0, -s, c]])).T
@@ -200,15 +200,15 @@ def _inclined() -> Sensor:
 
 
 def _bpearl() -> Sensor:
-    """Return a hemisphere, RoboSense's RS-Bpearl: 32 rings from 2.3 to 89.5 degrees, a column each 0.2 degrees."""
+    """Return RoboSense's RS-Bpearl, a hemisphere: 32 rings from 2.3 to 89.5 degrees, a column every 0.2 degrees."""
     elevation = np.radians(2.3125 + 2.8125 * np.arange(32))
     return Sensor("bpearl", _spinning(elevation, np.zeros(32), 1800), 0.1, 100.0)
 
 
 def _blk360() -> Sensor:
-    """Return a terrestrial scanner, Leica's BLK360 (2017): 360 x 300 degrees, on a robot that stops each 5 m.
+    """Return Leica's BLK360 (2017), a terrestrial scanner with 360 x 300 degrees, on a robot that stops every 5 m.
 
-    Its beams, 0.1 degrees apart in its fastest scan, are thinned to 0.6: 150,000 are left.
+    Its beams, 0.1 degrees apart in its fastest scan, are thinned to 0.6 degrees, which leaves 150,000.
     """
     elevation = np.radians(np.arange(-59.7, 90.0, 0.6))
     return Sensor("blk360", _spinning(elevation, np.zeros(250), 600), 0.6, 60.0, stop=5.0, stand=40.0)
@@ -221,7 +221,7 @@ def _os64(name: str = "os64", columns: int = 512) -> Sensor:
 
 
 def _mid360_beams(frame: int) -> Floats:
-    """Return a non-repetitive lidar's beams: 200,000 a second, -7 to 52 degrees, another pattern in each frame."""
+    """Return a non-repetitive lidar's beams: 200,000 per second, -7 to 52 degrees, a new pattern in each frame."""
     count, low, high = 20_000, np.radians(-7.0), np.radians(52.0)
     t = (frame * count + np.arange(count)) * FRAME_PERIOD / count
     # two frequencies without a common multiple fill the field of view in about a second

@@ -1,9 +1,9 @@
 """A simulated world on disk: a base map, a run of a robot, and the truth.
 
-OUT/base.laz                   airborne scan, map frame; of a depot also terrestrial scans of its hall
-OUT/run/frames/000000.pcd ...  deskewed frames, sensor frame (the body's, without a mount)
+OUT/base.laz                   airborne scan, map frame; for a depot also terrestrial scans of its hall
+OUT/run/frames/000000.pcd ...  deskewed frames, sensor frame (body frame without a mount)
 OUT/run/odometry.tum           odom <- body, drifting
-OUT/sweeps                     of a world with motion: a ROS recording with the raw sweeps and more odometry
+OUT/sweeps                     in a world with motion, a ROS recording with the raw sweeps and more odometry
 OUT/truth.tum                  map <- body
 OUT/world.json                 the configuration, and counts of points and frames
 """
@@ -58,10 +58,10 @@ class SimulationConfig:
     changed: float = 0.0  # share of the trees, cars and poles that were replaced since the map was made
     origin: tuple[float, float, float] = (0.0, 0.0, 0.0)  # added to all map coordinates, metres (a UTM-like offset)
     speed: float = 1.5  # of the robot, metres per second
-    height: float = 1.5  # of the body above the ground, metres; with a mount the sensor is off by its z
+    height: float = 1.5  # of the body above the ground, metres; a mount adds its z for the sensor
     odometry: OdometryConfig = field(default_factory=OdometryConfig)  # errors of the odometry
     dirt: Dirt = field(default_factory=Dirt)  # further imperfections; none by default
-    drive_seed: int = 0  # of the drive, its scans and its odometry: another run through the same world
+    drive_seed: int = 0  # of the drive, its scans and its odometry; another seed is another run in the same world
     mount: Mount = field(default_factory=Mount)  # of the sensor on the body
 
     def __post_init__(self) -> None:
@@ -101,7 +101,7 @@ _AIRBORNE, _DRIVE, _SENSOR, _ODOMETRY, _INDOORS = range(100, 105)  # random stre
 
 @dataclass(frozen=True)
 class Simulated:
-    """World that :func:`simulate` wrote: its directory, base points, frames of the run, and metres driven."""
+    """World written by :func:`simulate`: directory, base points, frames of the run, and metres driven."""
 
     directory: Path
     base_points: int
@@ -116,10 +116,10 @@ def simulate(
     progress: bool = False,
     overwrite: bool = False,
 ) -> Simulated:
-    """Write a simulated world to the directory ``out``, completely or not at all.
+    """Write a simulated world to the directory ``out``, atomically.
 
-    ``progress`` draws a bar on stderr. ``overwrite`` replaces an earlier simulated world; a directory with other files
-    is refused.
+    ``progress`` draws a bar on stderr. ``overwrite`` replaces an earlier simulated world, but no directory with other
+    files.
 
     Raises:
         InputError: ``out`` exists and is not empty, or cannot be written.
@@ -159,7 +159,7 @@ def scene_of(config: SimulationConfig) -> Scene:
 
 
 def base_map(scene: Scene, config: SimulationConfig, step: Progress | None = None) -> Floats:
-    """Scan the scene from the air: (N, 3) float64 metres, scene frame (``config.origin`` not added)."""
+    """Scan the scene from the air: (N, 3) float64 metres, scene frame (without ``config.origin``)."""
     dirt = config.dirt
     caster: MeshCaster = Caster(scene.mapped)
     if dirt.seasons is not None:
@@ -181,7 +181,7 @@ def base_map(scene: Scene, config: SimulationConfig, step: Progress | None = Non
 
 
 def _indoors(scene: Scene, hall: Footprint, rng: np.random.Generator) -> Floats:
-    """Scan a hall from stands in it and before its gates, as walls have two sides: (N, 3) float64, scene frame."""
+    """Scan a hall from inside and from its gates, as walls have two sides: (N, 3) float64, scene frame."""
     scanner, caster = SENSORS["blk360"](), Caster(scene.mapped)
     ahead = np.array([np.cos(hall.yaw), np.sin(hall.yaw)])
     clouds = []
@@ -196,7 +196,7 @@ def _indoors(scene: Scene, hall: Footprint, rng: np.random.Generator) -> Floats:
 def trajectories(scene: Scene, config: SimulationConfig) -> tuple[Floats, Floats, Floats]:
     """Return stamps (N,) in seconds, true poses ``T_scene_body`` (N, 4, 4) and odometry ``T_odom_body`` (N, 4, 4).
 
-    A robot that stops to scan has one of each where it stands.
+    A robot that stops to scan has one of each per stop.
     """
     moving = _seconds(config)[0]
     truth = drive(scene, config.length, config.speed, config.height, _stream(config, _DRIVE), moving)
@@ -219,10 +219,9 @@ def frames(
     odometry: Floats | None = None,
     recording: Recording | None = None,
 ) -> Iterator[Points]:
-    """Scan the scene as it is now from each true pose; (N, 3) float32 metres, sensor frame.
+    """Scan the present scene from each true pose; (N, 3) float32 metres, sensor frame.
 
-    ``odometry`` (N, 4, 4) deskews raw sweeps; without it the truth does. ``recording`` takes the raw sweeps of a world
-    with motion.
+    ``odometry`` (N, 4, 4), else the truth, deskews raw sweeps; ``recording`` gets the raw sweeps if there is motion.
     """
     sensor = SENSORS[config.sensor]()
     if config.dirt.on_sensor:
@@ -237,7 +236,7 @@ def frames(
 
 
 def _seconds(config: SimulationConfig) -> tuple[float, float]:
-    """Return the seconds that the robot drives, and those that it stands, from frame to frame."""
+    """Return the seconds that the robot drives and stands between frames."""
     sensor = SENSORS[config.sensor]()
     return (sensor.stop / config.speed, sensor.stand) if sensor.stop else (FRAME_PERIOD, 0.0)
 
@@ -258,7 +257,7 @@ def _stream(config: SimulationConfig, purpose: int) -> np.random.Generator:
 
 @contextmanager
 def _staging(out: Path, overwrite: bool) -> Iterator[Path]:
-    """Yield a directory next to ``out``: renamed to ``out`` on success, removed on an error."""
+    """Yield a directory next to ``out``, renamed to ``out`` on success and removed on an error."""
     if out.exists() and not out.is_dir():
         raise InputError(f"{out}: is a file; name a new directory")
     ours = (out / "world.json").is_file()

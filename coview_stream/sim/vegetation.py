@@ -1,4 +1,4 @@
-"""Vegetation, boulders and fallen trunks: trunks are solid, foliage lets some rays pass."""
+"""Vegetation, boulders and fallen trunks; trunks are solid, foliage lets some rays pass."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ class TreeMix(NamedTuple):
     """Sizes and shapes of a scene's trees."""
 
     height: tuple[float, float]  # range, metres
-    spread: tuple[float, float] = (0.16, 0.28)  # range of the crown's radius, share of the height
+    spread: tuple[float, float] = (0.16, 0.28)  # range of the crown's radius, as a share of the height
     conifers: float = 0.0  # share of the trees
 
 
@@ -36,7 +36,7 @@ def draw_tree(rng: np.random.Generator, x: float, y: float, species: TreeMix) ->
 
 
 def trunks(trees: Floats, ground: Floats) -> Mesh:
-    """Return tapering, slightly leaning trunks of (N, 8) trees on (N,) ground heights."""
+    """Return tapering, slightly leaning trunks of trees (N, 8) on ground heights (N,)."""
     if not len(trees):
         return EMPTY
     x, y, height, _, _, lean_x, lean_y, seed = trees.T
@@ -51,7 +51,7 @@ def trunks(trees: Floats, ground: Floats) -> Mesh:
 
 
 def crowns(trees: Floats, ground: Floats) -> Mesh:
-    """Return the foliage of (N, 8) trees: lumpy crowns, and three-storey cones for conifers."""
+    """Return the foliage of trees (N, 8): lumpy crowns, and three-storey cones for conifers."""
     conifer = trees[:, 4] > 0.5
     return join([_broadleaf(trees[~conifer], ground[~conifer]), _conifers(trees[conifer], ground[conifer])])
 
@@ -107,7 +107,7 @@ def undergrowth(rng: np.random.Generator, site: Site, count: int, extent: float)
 
 
 def strip(site: Site, line: Floats, thickness: float, height: float) -> Mesh:
-    """Return a hedge, wall or fence along a polyline (K, 2), following the ground."""
+    """Return a hedge, wall or fence that follows the ground along a polyline (K, 2)."""
     z = site.z(*line.T)
     parts = []
     for k in range(len(line) - 1):
@@ -146,6 +146,6 @@ def rocks(rng: np.random.Generator, site: Site, count: int, extent: float) -> Me
 
 
 def _noise(seed: Floats, k: int | Ints) -> Floats:
-    """Return repeatable numbers in [0, 1) from the trees' seeds, so a tree keeps its shape."""
+    """Return repeatable numbers in [0, 1) from the trees' seeds, so that a tree keeps its shape."""
     value = np.sin(seed * 12.9898 + np.asarray(k) * 78.233) * 43758.5453
     return np.asarray(value - np.floor(value))

@@ -1,1 +1,1 @@
-"""Training of the learned features: simulated worlds, their bird's-eye views, the networks."""
+"""Training of the learned features: simulated worlds, their bird's-eye views, and the networks."""

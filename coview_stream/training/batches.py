@@ -1,4 +1,4 @@
-"""Training batches: pieces of maps and queries in them, rotated, mirrored and augmented at random."""
+"""Training batches: pieces of maps with queries in them, rotated, mirrored and augmented at random."""
 
 from __future__ import annotations
 
@@ -12,11 +12,11 @@ from coview_stream.geometry.arrays import Floats, Indices, Ints
 from coview_stream.geometry.transforms import rot_z
 from coview_stream.training.worlds import QUERY_CELLS, WorldViews
 
-_HEIGHTS = LAYERS - 3  # height layers; then come the greatest height, ground seen, relief
+_HEIGHTS = LAYERS - 3  # height layers, followed by greatest height, ground seen and relief
 _TOP, _SEEN, _RELIEF = LAYERS - 3, LAYERS - 2, LAYERS - 1
-# probabilities and ranges of plausible changes, not measured
+# plausible probabilities and ranges of changes, not measured
 _CHANCE = 0.5  # of each change
-_MAX_FALLEN = 0.004  # disks per square metre: 40 a hectare
+_MAX_FALLEN = 0.004  # disks per square metre: 40 per hectare
 _RADII = (1.0, 2.5)  # metres
 
 
@@ -29,7 +29,7 @@ def augmented(image: Image, aerial: bool, rng: np.random.Generator) -> Image:
         image[:_HEIGHTS] *= rng.random(image[:_HEIGHTS].shape, dtype=np.float32) > rng.uniform(0.0, 0.5)
         image[_SEEN] *= rng.random(image[_SEEN].shape, dtype=np.float32) > rng.uniform(0.0, 0.5)
     if rng.random() < 0.5 * _CHANCE:
-        if aerial:  # dense leaves hide the layers below
+        if aerial:  # dense leaves hide lower layers
             image[: int(rng.integers(1, 4))] = 0
         else:  # the field of view ends below the upper layers
             image[int(rng.integers(3, _HEIGHTS)) : _HEIGHTS] = 0
@@ -46,7 +46,7 @@ def augmented(image: Image, aerial: bool, rng: np.random.Generator) -> Image:
 
 
 def _fell(image: Image, rng: np.random.Generator) -> None:
-    """Clear disks of all height layers, as if trees were gone; the ground layers stay."""
+    """Clear disks in all height layers, as if trees had gone; the ground layers stay."""
     height, width = image.shape[1:]
     count = rng.poisson(rng.uniform(0.0, _MAX_FALLEN) * height * width * CELL**2)
     for row, column, radius in zip(
@@ -61,31 +61,31 @@ def _fell(image: Image, rng: np.random.Generator) -> None:
 
 
 PIECE = 272
-"""Cells of a piece of the map: 136 m."""
+"""Cells along an edge of a piece of the map, 136 m."""
 
-_REACH = 36.0  # metres from a piece's middle within which queries stand: their 30 m must lie on it
-_ROTATED = 0.5  # share of the pieces that are rotated by any angle, not only by quarters
+_REACH = 36.0  # metres from a piece's centre within which queries lie, so that their 30 m are on the piece
+_ROTATED = 0.5  # share of the pieces that are rotated by any angle, not only by quarter turns
 _NARROWED = 0.4  # share of the queries that are cut at a random radius
-_SECTOR_LOST = 0.25  # share that lose a sector
-_FROM_MAP = 0.1  # share that are cut from the map: driving all around a tree shows its whole crown, too
+_SECTOR_LOST = 0.25  # share of the queries that lose a sector
+_FROM_MAP = 0.1  # share of the queries cut from the map: driving all around a tree shows its whole crown too
 _RADIUS = 30.0  # metres, of a query
-_TRIES = 50  # middles of a piece drawn until there are enough queries near it
+_TRIES = 50  # centres drawn for a piece until enough queries are near
 
 
 @dataclass(frozen=True)
 class Batch:
-    """G pieces of maps of different worlds and Q queries."""
+    """G map pieces of different worlds, and Q queries."""
 
     pieces: Image  # (G, LAYERS, PIECE, PIECE)
     queries: Image  # (Q, LAYERS, 128, 128)
-    piece_of: Ints  # (Q,) which piece a query stands in
-    poses: Floats  # (Q, 3) x, y and heading of the queries in their piece's frame, whose origin is its middle
+    piece_of: Ints  # (Q,) index of each query's piece
+    poses: Floats  # (Q, 3) x, y and heading of the queries in the frame of their piece, from its centre
 
 
 def draw_batch(
     worlds: Sequence[WorldViews], pieces: int, each: int, rng: np.random.Generator, augment: bool = True
 ) -> Batch:
-    """Draw ``pieces`` maps of as many worlds, with ``each`` queries per map; ``augment`` changes the images."""
+    """Draw ``pieces`` map pieces of different worlds with ``each`` queries; ``augment`` changes the images."""
     images, queries, owners, poses = [], [], [], []
     for owner, k in enumerate(rng.choice(len(worlds), pieces, replace=False)):
         world = worlds[int(k)]
@@ -112,7 +112,7 @@ def draw_batch(
 
 
 def _middle(world: WorldViews, count: int, rng: np.random.Generator) -> tuple[Floats, Indices]:
-    """Draw the middle (2,) of a piece with ``count`` queries near it, or with the most, and their indices (K,)."""
+    """Draw the centre (2,) of a piece near ``count`` queries, or near the most, and the queries' indices (K,)."""
     best, most = np.zeros(2), np.zeros(0, dtype=np.intp)
     for _ in range(_TRIES):
         centre = world.poses[rng.integers(len(world.poses)), :2] + rng.uniform(-0.7, 0.7, 2) * _REACH
@@ -125,7 +125,7 @@ def _middle(world: WorldViews, count: int, rng: np.random.Generator) -> tuple[Fl
 
 
 def _piece(world: WorldViews, centre: Floats, turn: float, mirrored: bool, size: int = PIECE) -> Image:
-    """Cut a piece with its middle at ``centre``: ``p_world = R(turn) p_piece + centre``."""
+    """Cut a piece around ``centre``: ``p_world = R(turn) p_piece + centre``."""
     at = (np.arange(size) + 0.5 - size / 2) * CELL
     x, y = np.meshgrid(at, -at if mirrored else at, indexing="xy")
     column = (np.cos(turn) * x - np.sin(turn) * y + centre[0] - world.corner[0]) / CELL
@@ -139,7 +139,7 @@ def _piece(world: WorldViews, centre: Floats, turn: float, mirrored: bool, size:
 
 
 def _query(image: Image, mirrored: bool, rng: np.random.Generator) -> tuple[Image, float]:
-    """Mirror a query, rotate it by quarters and hide parts; return it and the change of its heading, radians."""
+    """Mirror a query, rotate it by quarter turns and hide parts; return it and its heading change, radians."""
     if mirrored:
         image = image[:, ::-1]
     quarters = int(rng.integers(4))
@@ -152,5 +152,5 @@ def _query(image: Image, mirrored: bool, rng: np.random.Generator) -> tuple[Imag
         hidden |= np.abs((direction + np.pi) % (2 * np.pi) - np.pi) < rng.uniform(0.2, 1.0)
     image[:, hidden] = 0
     image[-1][hidden] = 128
-    # rot90 turns towards lower rows, i.e. clockwise as seen from above: the heading compensates
+    # rot90 turns towards lower rows, i.e. clockwise seen from above; the heading compensates
     return image, 0.5 * np.pi * quarters

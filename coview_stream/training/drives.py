@@ -1,4 +1,4 @@
-"""Drives through training worlds: a path, the frames along it, and their submap by a drifting odometry."""
+"""Drives through training worlds: a path, the frames along it, and their submap by drifting odometry."""
 
 from __future__ import annotations
 
@@ -19,18 +19,18 @@ from coview_stream.training.recipe import Recipe
 from coview_stream.training.sensors import DriveDirt, trained_sensor
 
 CLEARANCE = 0.6
-"""Metres between the robot's middle and a stem."""
+"""Metres between the robot's centre and a stem."""
 
 STEP = 0.1
 """Metres between the points of a path."""
 
-_CANDIDATES = 150  # random paths of which the longest free one is taken
-_COARSE = 5  # steps between the points that are tested
+_CANDIDATES = 150  # random paths, of which the longest free one is used
+_COARSE = 5  # steps between tested points
 _LANE = 0.7  # metres to either side of a street's middle
 
 
 def between_trees(rng: np.random.Generator, obstacles: Floats, extent: float, length: float) -> Floats:
-    """Draw a path (N, 2) of ``length`` metres, shorter where trees block it, that ends within +-``extent`` metres.
+    """Draw a path (N, 2) of ``length`` metres, or shorter if trees block it, that ends within +-``extent`` metres.
 
     ``obstacles`` (K, 3) are x, y and radius, metres.
     """
@@ -38,7 +38,7 @@ def between_trees(rng: np.random.Generator, obstacles: Floats, extent: float, le
     at = np.arange(count) * STEP
     end = rng.uniform(-extent, extent, (_CANDIDATES, 2))
     heading = rng.uniform(0, 2 * np.pi, (_CANDIDATES, 1))
-    # curvature changes along the way: at most a turn of 90 degrees in 8 m
+    # curvature changes along the path: at most 90 degrees in 8 m
     bend = rng.normal(0, 0.06, (_CANDIDATES, 1)) + rng.normal(0, 0.1, (_CANDIDATES, 1)) * np.sin(
         2 * np.pi * at / rng.uniform(8, 25, (_CANDIDATES, 1)) + rng.uniform(0, 6, (_CANDIDATES, 1))
     )
@@ -59,7 +59,7 @@ def between_trees(rng: np.random.Generator, obstacles: Floats, extent: float, le
 
 
 def along_streets(rng: np.random.Generator, layout: Layout, extent: float, length: float) -> Floats:
-    """Draw a path (N, 2) of up to ``length`` metres in a street, that ends within +-``extent`` metres."""
+    """Draw a path (N, 2) of up to ``length`` metres along a street that ends within +-``extent`` metres."""
     streets = [line for line in (layout.route, *layout.streets) if (np.abs(line) < extent).all(axis=1).any()]
     line = streets[int(rng.integers(len(streets)))]
     line = line if rng.random() < 0.5 else line[::-1]
@@ -76,20 +76,20 @@ def along_streets(rng: np.random.Generator, layout: Layout, extent: float, lengt
 
 
 RADIUS = 30.0
-"""Metres about the newest position within which points are kept."""
+"""Metres around the newest position within which points are kept."""
 
 VOXEL = 0.25
-"""Metres: one point is kept per voxel, as in the map."""
+"""Edge of a voxel, metres; one point per voxel is kept, as in the map."""
 
 _SPEED = 1.2  # metres per second
 _WHEELBASE = 1.0  # metres
-_PAUSE = 3  # frames between two that are kept while the robot stands
-_STEP_SHARE = {"vlp16-inclined": 0.4}  # of the usual step: one of its frames covers a narrow band only
-_MIN_FRAMES = {"mid360": (5, 12), "vlp16-inclined": (8, 20)}  # drawn in between
+_PAUSE = 3  # frames from one kept frame to the next while the robot stands
+_STEP_SHARE = {"vlp16-inclined": 0.4}  # of the usual step, as each of its frames covers only a narrow band
+_MIN_FRAMES = {"mid360": (5, 12), "vlp16-inclined": (8, 20)}  # range from which the number is drawn
 
 
 class Submap(NamedTuple):
-    """A robot's local cloud and its true pose: one query."""
+    """A query: a robot's local cloud and its true pose."""
 
     points: Points  # (N, 3) metres, odometry's axes, origin at the newest position of the sensor
     pose: Floats  # (3,) x, y and yaw: p_world = R(yaw) p + (x, y)
@@ -102,7 +102,7 @@ class Frames(NamedTuple):
     truth: Floats  # (F, 4, 4) map <- sensor
     odometry: Floats  # (F, 4, 4) odometry <- sensor, drifting
     clouds: tuple[Points, ...]  # (N, 3) of each frame, the sensor's axes, metres
-    lean: Floats  # (2,) roll and pitch by which the odometry's gravity is off, radians
+    lean: Floats  # (2,) error of the odometry's gravity direction, roll and pitch, radians
     travelled: float  # metres driven
 
 
@@ -115,7 +115,7 @@ def scanned(
     sensor: str,
     porosity: float,
 ) -> Frames:
-    """Drive a path (N, 2) over the ``ground`` with a sensor, to its end."""
+    """Drive a path (N, 2) over the ``ground`` to its end, and scan."""
     along, frames = _moments(rng, recipe, path, sensor)
     heading = directions(path) if len(path) > 2 else np.full(len(path), rng.uniform(0, 2 * np.pi))
     T = _poses(rng, recipe, path[along], heading[along], ground)
@@ -159,7 +159,7 @@ def gathered(frames: Frames) -> Submap:
 
 
 def _moments(rng: np.random.Generator, recipe: Recipe, path: Floats, sensor: str) -> tuple[Ints, Ints]:
-    """Draw the indices (K,) of the path's points that have a frame, and the sensor's frame numbers (K,) there."""
+    """Draw the indices (K,) of the path's points with a frame, and the sensor's frame numbers (K,) there."""
     spacing = recipe.draw(rng, "frame_step") * _STEP_SHARE.get(sensor, 1.0)
     last = len(path) - 1
     along = last - (np.arange(0, last + 1, spacing / STEP)[::-1]).astype(np.int64)

@@ -23,7 +23,7 @@ from coview_stream.training.worlds import WorldViews
 _WARM_UP = 0.03  # share of the steps over which the learning rate rises
 _FINAL_RATE = 0.01  # share of the learning rate at the end
 _MAX_GRADIENT = 5.0  # norm
-_CHECKPOINT_STEPS = 100  # from one checkpoint to the next
+_CHECKPOINT_STEPS = 100  # between checkpoints
 
 Report = Callable[[int, Losses], None]
 
@@ -34,7 +34,7 @@ def train(
     """Train from scratch, or resume from the file ``checkpoint``, which is written every 100 steps.
 
     Raises:
-        InputError: the loss is not finite, or the checkpoint cannot be read or is of another configuration.
+        InputError: the loss is not finite, or the checkpoint cannot be read or has another configuration.
     """
     torch.manual_seed(config.seed)
     net: PlaceNet = PlaceNet(config.width)
@@ -47,7 +47,7 @@ def train(
             rise = min(1.0, (step + 1) / max(1.0, _WARM_UP * config.steps))
             fall = _FINAL_RATE + (1 - _FINAL_RATE) * 0.5 * (1 + math.cos(math.pi * step / config.steps))
             group["lr"] = config.rate * (rise * fall)
-        torch.manual_seed(config.seed + step)  # a resumed training goes on as if it had not stopped
+        torch.manual_seed(config.seed + step)  # a resumed training continues as if it had not stopped
         loss = _step(net, worlds, config, np.random.default_rng([config.seed, step]))
         if not torch.isfinite(loss.total):
             raise InputError(f"step {step}: the loss is not finite; train with a lower rate")
@@ -79,7 +79,7 @@ def _step(net: PlaceNet, worlds: Sequence[WorldViews], config: TrainingConfig, r
 
 
 def _seen(images: Any) -> torch.Tensor:
-    """Mark local cells (B, 1, H / 2, W / 2) in which anything but relief was seen: 1, else 0."""
+    """Return 1 for local cells (B, 1, H / 2, W / 2) in which anything except relief was seen, else 0."""
     anything = torch.from_numpy(images[:, :-1].any(axis=1, keepdims=True)).float()
     return torch.nn.functional.max_pool2d(anything, 2)
 

@@ -1,4 +1,4 @@
-"""Losses of the encoders: a query is to correlate with its map where it stands, and nowhere else."""
+"""Losses of the encoders: a query should correlate with its map at its pose and nowhere else."""
 
 from __future__ import annotations
 
@@ -10,22 +10,22 @@ from torch.nn import functional
 
 from coview_stream.descriptors.network import LOCAL_CELL, PLACE_CELL
 
-_COARSE = 2  # local cells to a coarse one: the dense search runs on 2 m
-_RADIUS = 29.0  # metres about a query's middle whose cells count
+_COARSE = 2  # local cells per coarse cell: the dense search runs on cells of 2 m
+_RADIUS = 29.0  # metres around a query's centre within which cells count
 _DENSE_SCALE = 20.0  # on scores in [-1, 1] before the softmax of the dense search
 _LOCAL_TEMPERATURE = 0.07  # of the softmax over local descriptors
-_PLACE_TEMPERATURE = 0.08  # of the softmax over global ones
+_PLACE_TEMPERATURE = 0.08  # of the softmax over global descriptors
 _SAMPLES = 128  # corresponding points of a query and its map
-_IGNORED_RADIUS = 2.5  # metres: other points within are neither right nor wrong
+_IGNORED_RADIUS = 2.5  # metres around a point within which other points are neither right nor wrong
 _SAME_PLACE = 12.0  # metres: the same for global descriptors
-_MIN_SIGMA = 0.05  # uncertainties below are taken for it
+_MIN_SIGMA = 0.05  # smaller uncertainties are raised to this
 _LOCAL_WEIGHT, _PLACE_WEIGHT = 0.5, 0.5  # relative to the dense loss
 _EXCLUDED = -1e4  # logit of a point that does not compete
 
 
 @dataclass(frozen=True)
 class Losses:
-    """The three losses (scalars), and the share of a batch's queries that the dense search places correctly."""
+    """Three scalar losses, and the share of a batch's queries that the dense search places correctly."""
 
     dense: Tensor
     local: Tensor
@@ -48,10 +48,10 @@ def losses(
 
     Args:
         query: local (Q, C, h, h), sigma (Q, 1, h, h), place (Q, P, ., .).
-        piece: the same of G pieces of (H, H) local cells.
+        piece: the same for G pieces of (H, H) local cells.
         piece_of: (Q,) the piece of each query.
-        poses: (Q, 3) x, y (metres), heading (radians) in the piece's frame about its middle.
-        wrong_yaws: (Q, N) wrong headings that compete with the true one, radians.
+        poses: (Q, 3) x, y (metres), heading (radians) in the piece's frame, from its centre.
+        wrong_yaws: (Q, N) wrong headings that compete with the true heading, radians.
         seen: (Q, 1, h, h) and (G, 1, H, H), 1 for local cells in which anything was seen, else 0.
     """
     dense, recall = dense_loss(query, piece, piece_of, poses, wrong_yaws)
@@ -62,7 +62,7 @@ def losses(
 def dense_loss(
     query: Encoded, piece: Encoded, piece_of: Tensor, poses: Tensor, wrong_yaws: Tensor
 ) -> tuple[Tensor, float]:
-    """Return the cross-entropy over all pieces, coarse cells and headings tried, and the share of correct queries."""
+    """Return the cross-entropy over all pieces, coarse cells and tried headings, and the share of correct queries."""
     local, sigma, _ = query
     axis = (torch.arange(local.shape[-1]) + 0.5 - local.shape[-1] / 2) * LOCAL_CELL
     weight = (torch.hypot(axis[:, None], axis[None]) < _RADIUS).to(local) / sigma
@@ -76,7 +76,7 @@ def dense_loss(
     size, half = maps.shape[-1], values.shape[-1] // 2
     spectrum = torch.fft.rfft2(values, s=(size, size)).conj()
     product = torch.einsum("qcyx,gcyx->qgyx", spectrum, torch.fft.rfft2(maps))
-    # a query whose upper left cell lies at (i, j) has its middle at the corner of cell (i + half, j + half)
+    # the centre of a query with its upper left cell at (i, j) is the corner of cell (i + half, j + half)
     last = size - 2 * half + 1
     scores = torch.fft.irfft2(product, s=(size, size))[..., :last, :last]
     logits = _DENSE_SCALE * scores.reshape(count, -1)
@@ -90,7 +90,7 @@ def dense_loss(
 
 
 def _soft_target(at: Tensor, piece_of: Tensor, tried: int, pieces: int, size: int) -> Tensor:
-    """Return weights (Q, tried, G, size, size) of the four cells about ``at`` (Q, 2) x, y; heading 0 is true."""
+    """Return weights (Q, tried, G, size, size) of the four cells around ``at`` (Q, 2) x, y; heading 0 is true."""
     target = torch.zeros(len(at), tried, pieces, size, size)
     low = at.floor()
     rows = torch.arange(len(at))
@@ -104,10 +104,10 @@ def _soft_target(at: Tensor, piece_of: Tensor, tried: int, pieces: int, size: in
 
 
 def local_loss(query: Encoded, piece: Encoded, piece_of: Tensor, poses: Tensor, seen: tuple[Tensor, Tensor]) -> Tensor:
-    """Make corresponding cells similar and others not, and sigma the error of that.
+    """Return a loss that makes only corresponding cells similar, and makes sigma the error of this match.
 
-    A cross-entropy e over corresponding points, each way, plus e / sigma + log sigma with e held constant: a high
-    uncertainty is never cheaper than a good descriptor. Only points seen in both images count.
+    It is the cross-entropy e over corresponding points, in both directions, plus e / sigma + log sigma with e held
+    constant, so that a high uncertainty is never cheaper than a good descriptor. Only points seen in both images count.
     """
     count = len(poses)
     radius = _RADIUS * 0.9 * torch.rand(count, _SAMPLES).sqrt()
@@ -133,7 +133,7 @@ def local_loss(query: Encoded, piece: Encoded, piece_of: Tensor, poses: Tensor, 
 
 
 def place_loss(query: Encoded, piece: Encoded, piece_of: Tensor, poses: Tensor) -> Tensor:
-    """Make a query's global descriptor most similar to that of the map around its place."""
+    """Return a loss that makes a query's global descriptor most similar to the map's around its place."""
     maps, half = piece[2], query[2].shape[-1] // 2
     ours = functional.normalize(query[2][:, :, half - 1 : half + 1, half - 1 : half + 1].mean((2, 3)), dim=1)
     size = maps.shape[-1]
@@ -152,7 +152,7 @@ def place_loss(query: Encoded, piece: Encoded, piece_of: Tensor, poses: Tensor) 
 
 
 def turn(images: Tensor, yaws: Tensor) -> Tensor:
-    """Rotate square images (N, C, n, n), row along y, about their middles by (N,) radians: ``p_out = R(yaw) p_in``."""
+    """Rotate square images (N, C, n, n), row along y, about their centres by (N,) radians: ``p_out = R(yaw) p_in``."""
     c, s = yaws.cos(), yaws.sin()
     zero = torch.zeros_like(c)
     inverse = torch.stack([torch.stack([c, s, zero], -1), torch.stack([-s, c, zero], -1)], 1)
@@ -161,6 +161,6 @@ def turn(images: Tensor, yaws: Tensor) -> Tensor:
 
 
 def _at(images: Tensor, points: Tensor) -> Tensor:
-    """Interpolate local images (Q, C, n, n) bilinearly at (Q, K, 2) metres about their middles: (Q, K, C)."""
+    """Interpolate local images (Q, C, n, n) bilinearly at (Q, K, 2) metres from their centres: (Q, K, C)."""
     grid = (points / (0.5 * LOCAL_CELL * images.shape[-1]))[:, :, None]
     return functional.grid_sample(images, grid, align_corners=False)[..., 0].transpose(1, 2)

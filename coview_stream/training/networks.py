@@ -1,4 +1,4 @@
-"""The two encoders in PyTorch, of the map from above and of a robot's scans; the files of their weights."""
+"""The two encoders in PyTorch, for the map from above and for a robot's scans, and the files of their weights."""
 
 from __future__ import annotations
 
@@ -30,14 +30,14 @@ from coview_stream.geometry.arrays import Floats32
 VIEWS = ("aerial", "ground")
 
 LOCAL = 32
-"""Numbers in a local descriptor (one per square metre)."""
+"""Numbers in a local descriptor; there is one descriptor per square metre."""
 
 PLACE = 128
 """Numbers in a global descriptor."""
 
 
 class _Conv(nn.Module):
-    """A 3 x 3 convolution shared by both views, with a normalisation for each: their statistics differ."""
+    """A 3 x 3 convolution for both views, with one normalisation per view, as their statistics differ."""
 
     def __init__(self, inputs: int, outputs: int, stride: int = 1) -> None:
         super().__init__()
@@ -49,7 +49,7 @@ class _Conv(nn.Module):
 
 
 class _Residual(nn.Module):
-    """Two convolutions whose result is added to their input."""
+    """A residual block of two convolutions."""
 
     def __init__(self, channels: int) -> None:
         super().__init__()
@@ -60,7 +60,7 @@ class _Residual(nn.Module):
 
 
 class _Entry(nn.Module):
-    """The layers that each view has for itself, at 1 m: crowns from above and stems from below look different."""
+    """The separate layers of each view, at 1 m, as crowns from above and stems from below look different."""
 
     def __init__(self, width: int) -> None:
         super().__init__()
@@ -72,10 +72,10 @@ class _Entry(nn.Module):
 
 
 class PlaceNet(nn.Module):
-    """Encoder of bird's-eye views: local descriptors, their uncertainty, global descriptors; fully convolutional.
+    """Fully convolutional encoder of bird's-eye views to local descriptors, their uncertainty, and global descriptors.
 
-    Input (B, LAYERS, H, W) in [0, 1], H and W multiples of 8; cells of 0.5 m. Output: local (B, LOCAL, H/2, W/2) of
-    unit norm, sigma (B, 1, H/2, W/2) > 0, place (B, PLACE, H/8, W/8) of unit norm.
+    The input is (B, LAYERS, H, W) in [0, 1], with H and W multiples of 8 and cells of 0.5 m. The outputs are local
+    (B, LOCAL, H/2, W/2) of unit norm, sigma (B, 1, H/2, W/2) > 0, and place (B, PLACE, H/8, W/8) of unit norm.
     """
 
     def __init__(self, width: int = 24) -> None:
@@ -109,7 +109,7 @@ class PlaceNet(nn.Module):
         merged = functional.relu(self.lateral[0](at1) + _doubled(merged))
         local = functional.normalize(self.local(merged), dim=1)
         sigma = functional.softplus(self.sigma(merged)) + MIN_SIGMA
-        # the generalised mean (GeM) under a round window about every cell, then a linear layer
+        # generalised mean (GeM) under a round window around every cell, then a linear layer
         raised = at4.clamp(min=MIN_ACTIVATION).pow(self.power)
         down = functional.conv2d(raised, self.window, padding=(PLACE_REACH, 0), groups=4 * self.width)
         across = self.window.transpose(2, 3)
@@ -123,9 +123,9 @@ def _doubled(x: Tensor) -> Tensor:
 
 
 def export(net: PlaceNet, directory: Path, card: dict[str, Any]) -> list[Path]:
-    """Write one file of weights per view and the card that records how they were made; a file is complete or absent.
+    """Write one file of weights per view, and the card that records the training; each file atomically.
 
-    The card also holds the files' hashes, which tell one view's weights from the other's.
+    The card also has the files' hashes, which identify the view of each.
     """
     directory.mkdir(parents=True, exist_ok=True)
     written = []
@@ -133,7 +133,7 @@ def export(net: PlaceNet, directory: Path, card: dict[str, Any]) -> list[Path]:
         arrays = {"power": net.power.detach().numpy()}
         for layer in LAYER_NAMES:
             arrays[f"{layer}.weight"], arrays[f"{layer}.bias"] = _folded(_module(net, layer, view), view)
-        # bytes come in, and cells of 0.5 m one after the other
+        # inputs are bytes, and cells of 0.5 m follow one another
         stem = arrays["stem.weight"] / np.float32(255.0)
         by_cell = stem.reshape(3, 3, LAYERS, 4, -1).swapaxes(2, 3)
         arrays["stem.weight"] = by_cell.reshape(stem.shape)
@@ -147,7 +147,7 @@ def export(net: PlaceNet, directory: Path, card: dict[str, Any]) -> list[Path]:
 
 
 def _module(net: PlaceNet, layer: str, view: int) -> nn.Module:
-    """Return the module of a layer, by its name in the file."""
+    """Return the module of a layer by its name in the file."""
     own = layer.startswith(("stem", "block"))
     module: nn.Module = net.get_submodule(f"entry.{view}.{layer}" if own else layer)
     return module
@@ -166,7 +166,7 @@ def _folded(module: Any, view: int) -> tuple[Floats32, Floats32]:
 
 
 def encoder(net: PlaceNet, view: str) -> Callable[[Image], Features]:
-    """Return a network in training with the interface of the exported :class:`~.descriptors.network.Network`."""
+    """Give a network in training the interface of the exported :class:`~.descriptors.network.Network`."""
 
     def encode(image: Image) -> Features:
         with torch.no_grad():

@@ -1,8 +1,8 @@
 """Sensors of training drives, and their dirt.
 
 The sensors are the simulator's. The dirt is the part of :mod:`coview_stream.sim.dirt` that matters in a forest: a
-leaning sensor, beams of finite width, noise that grows with the range, tall grass, each up to twice its default
-strength. Seasons are the recipe's ``leaf_off``. Dirt has random numbers of its own: a drive without it stays the same.
+leaning sensor, beams of finite width, noise that grows with the range, and tall grass, each up to twice its default
+strength. Seasons are the recipe's ``leaf_off``. Dirt has its own random numbers, so a drive without it does not change.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ _GROUP = {"vlp16": 16, "vlp16-inclined": 16, "os64": 64, "os64-2048": 64, "bpear
 
 
 def trained_sensor(name: str, stride: Callable[[int], int] | None = None) -> Sensor:
-    """Make a sensor by its name; ``stride`` maps its number of beams to n: only every n-th column is cast."""
+    """Return a sensor by name; ``stride`` maps its number of beams to n, and only every n-th column is cast."""
     sensor = SENSORS[name]()
     nth = 1 if stride is None else max(1, stride(len(sensor.beams(0))))
     if nth == 1:
@@ -34,7 +34,7 @@ def trained_sensor(name: str, stride: Callable[[int], int] | None = None) -> Sen
 
     def thinned(frame: int) -> Floats:
         rays = beams(frame)
-        # other columns in each frame: together they cover all
+        # different columns in each frame, which together cover all
         return np.asarray(rays[(np.arange(len(rays)) // group + frame) % nth == 0])
 
     return replace(sensor, beams=thinned)
@@ -43,18 +43,18 @@ def trained_sensor(name: str, stride: Callable[[int], int] | None = None) -> Sen
 TRAINED_DIRT = ("mounting", "beams", "grass")
 """Kinds of dirt that training drives can have."""
 
-_STRONGEST = 2.0  # times the default of the simulator
-_ON_GROUND = 0.15  # metres above the ground up to which grass hides points
-_STEEPEST = 0.05  # cosine of the incidence: bounds the way of flat beams through grass
+_STRONGEST = 2.0  # greatest multiple of the simulator's default
+_ON_GROUND = 0.15  # metres above the ground below which grass hides points
+_STEEPEST = 0.05  # least cosine of the incidence: bounds the path of flat beams through grass
 
 
 class DriveDirt(NamedTuple):
     """Dirt of one drive; None for kinds that are off."""
 
-    T_body_sensor: Pose  # (4, 4) of the sensor, whose points are sent as the body's
+    T_body_sensor: Pose  # (4, 4), of a sensor whose points are sent as if in the body frame
     beams: Beams | None  # width and noise of its beams
-    grass: Grass | None  # off the roads, here everywhere
-    rng: np.random.Generator  # random numbers of all of it
+    grass: Grass | None  # here everywhere, not only off the roads
+    rng: np.random.Generator  # random numbers of all dirt
 
     @classmethod
     def draw(cls, kinds: tuple[str, ...], rng: np.random.Generator) -> DriveDirt:
@@ -87,7 +87,7 @@ class DriveDirt(NamedTuple):
     def _hits(
         self, caster: Caster, ground: Callable[[Floats, Floats], Floats], T: Pose, rays: Floats, porosity: float
     ) -> tuple[Floats, Floats]:
-        """Return ranges (N,) and cosines (N,) of the incidence along ``rays`` (N, 3) of the sensor."""
+        """Return ranges (N,) and cosines of the incidence (N,) along ``rays`` (N, 3) in the sensor frame."""
         origins = np.broadcast_to(T[:3, 3].astype(np.float32), rays.shape)
         hits = caster.trace(origins, (rays @ T[:3, :3].T).astype(np.float32), self.rng, porosity)
         distance, strength = hits.distance.astype(np.float64), hits.incidence.astype(np.float64)

@@ -14,7 +14,7 @@ from coview_stream.training.recipe import Recipe
 from coview_stream.training.tree_meshes import join_standing
 from coview_stream.training.trees import PATTERNS, Terrain, Trees, draw_species, draw_stems, draw_trees, opened
 
-_STEEPNESS = ((0.0, 0.1), (0.1, 0.4), (0.4, 1.0))  # flat, hilly, steep: shares of the range
+_STEEPNESS = ((0.0, 0.1), (0.1, 0.4), (0.4, 1.0))  # flat, hilly, steep, as shares of the range
 
 
 class Stand(NamedTuple):
@@ -23,7 +23,7 @@ class Stand(NamedTuple):
     mapped: SceneState  # geometry when the map is flown
     now: SceneState  # geometry when the robot drives
     terrain: Terrain  # the ground
-    trees: Trees  # all trees of either time
+    trees: Trees  # all trees of both times
     obstacles: Floats  # (N, 3) x, y and radius of obstacles for the robot, metres
     drawn: dict[str, Any]  # values that were drawn for the stand, for JSON
 
@@ -41,7 +41,7 @@ def draw_stand(rng: np.random.Generator, recipe: Recipe, half: float) -> Stand:
     species = draw_species(rng, recipe)
     trees = draw_trees(rng, recipe, terrain, xy, species)
     first, second = (bool(winter) for winter in rng.random(2) < recipe.leaf_off)
-    winters = (first, first if rng.random() < 0.5 else second)  # half of the cases have one season
+    winters = (first, first if rng.random() < 0.5 else second)  # in half of the cases both times are in the same season
     mortality, wind = recipe.draw(rng, "mortality"), recipe.draw(rng, "wind")
     understory = recipe.draw(rng, "understory") * float(rng.random() < 0.8)
     leaves = tree_meshes.crowns(rng, trees)
@@ -54,7 +54,7 @@ def draw_stand(rng: np.random.Generator, recipe: Recipe, half: float) -> Stand:
     leafless = trees.dead | (any(winters) & ~trees.evergreen)
     branches = tree_meshes.branches(rng, trees, rng.poisson(np.where(leafless, bare, living)))
     woody = [tree_meshes.stems(trees), branches]
-    # a share of the trees stands, or has leaves, at one of the two times only
+    # a share of the trees stands, or has leaves, at only one of the two times
     fate = np.where(rng.random(len(xy)) < mortality, rng.integers(1, 4, len(xy)), 0)
     there, leafed = (fate != 2, fate != 1), (fate >= 0, fate != 3)
     shifts = (None, rng.normal(0, wind, (len(xy), 2)))
@@ -64,7 +64,7 @@ def draw_stand(rng: np.random.Generator, recipe: Recipe, half: float) -> Stand:
         grown = rng.random(len(bushes.owner)) < 0.85  # the understory changes most
         foliage = join([join_standing(leaves, green, shifts[k]), join_standing([bushes], grown)])
         states.append(SceneState(join([*solid, join_standing(woody, there[k])]), foliage))
-    # leaves that hang to the ground block the robot as well
+    # leaves that hang to the ground block the robot too
     hanging = (trees.base < 1.6) & ~trees.dead
     radius = np.where(hanging, np.maximum(0.6 * trees.crown, trees.radius), trees.radius)
     obstacles = np.column_stack([trees.x, trees.y, radius])[there[1]]

@@ -22,8 +22,8 @@ from coview_stream.training.sensors import TRAINED_DIRT
 from coview_stream.training.worlds import WorldViews, read_world, write_dataset
 from coview_stream.version import __version__
 
-_REPORT_STEPS = 20  # from one line of progress to the next
-_HELD_OUT = 19_000  # first seed of the worlds that training never sees
+_REPORT_STEPS = 20  # between lines of progress
+_HELD_OUT = 19_000  # first seed of the worlds that training never uses
 
 Say = Callable[[str], None]
 """Takes a line of progress."""
@@ -33,10 +33,10 @@ Say = Callable[[str], None]
 class Plan:
     """Plan of a training: its worlds and its settings; the card next to the weights holds it."""
 
-    worlds: int = 62  # number of worlds to train on; their seeds are consecutive from first
+    worlds: int = 62  # number of training worlds, whose seeds are consecutive
     first: int = 10_000  # first seed
-    validation: int = 8  # number of worlds of other seeds on which the result is evaluated
-    most: int = 60  # maximum of queries evaluated in each of them
+    validation: int = 8  # number of worlds with other seeds for the evaluation
+    most: int = 60  # most queries evaluated in each of these
     recipe: Recipe = field(default_factory=Recipe)  # ranges that worlds are drawn from
     training: TrainingConfig = field(default_factory=TrainingConfig)  # settings of the training loop
 
@@ -50,12 +50,12 @@ class Plan:
 
     @property
     def seeds(self) -> range:
-        """Seeds of the worlds to train on."""
+        """Seeds of the training worlds."""
         return range(self.first, self.first + self.worlds)
 
     @property
     def held_out(self) -> range:
-        """Seeds of the worlds to evaluate on."""
+        """Seeds of the evaluation worlds."""
         return range(_HELD_OUT, _HELD_OUT + self.validation)
 
     def with_dirt(self) -> Plan:
@@ -69,7 +69,7 @@ class Plan:
 
 
 DEFAULT = Plan()
-"""The plan that the weights in the package were made by."""
+"""Plan of the weights in the package."""
 
 SMOKE = Plan(
     worlds=3,
@@ -88,19 +88,19 @@ SMOKE = Plan(
     ),
     training=TrainingConfig(steps=100, pieces=2, each=6, rate=1e-2, width=8, wrong=2),
 )
-"""A minute on two cores: shows that everything works and something is learnt, not how good it can get."""
+"""Plan for a minute on two cores: shows that training works and learns, not how good it can get."""
 
 
 def train_session(
     out: Path, plan: Plan, workers: int = 2, threads: int = 0, say: Say = lambda line: None
 ) -> dict[str, Any]:
-    """Train into the directory ``out`` and return the card that is written there with the weights.
+    """Train into the directory ``out``, and return the card that is written there with the weights.
 
-    Worlds that are in ``out / worlds`` already are not simulated again, and a training that was interrupted goes on.
+    Worlds that are already in ``out / worlds`` are reused, and an interrupted training resumes.
 
     Raises:
-        ConfigError: a number is out of range. InputError: something cannot be written, or the directory holds
-            worlds of another recipe or the state of another training.
+        ConfigError: a number is out of range. InputError: a file cannot be written, or the directory holds worlds of
+            another recipe or the state of another training.
         DependencyError: PyTorch is not installed.
     """
     torch = require_library("torch", "torch==2.13.0", "training (extra learn-train)")
@@ -148,7 +148,7 @@ def train_session(
 
 
 def evaluate(worlds: Sequence[WorldViews], aerial: Any, ground: Any, max_queries: int) -> dict[str, Any]:
-    """Evaluate the share of queries found, over all and by sensor, and the share by chance."""
+    """Return the share of queries found, in total and by sensor, and the share by chance."""
     results = search_queries(worlds, aerial, ground, max_queries)
     area = float(np.mean([world.aerial[0].size * 0.25 for world in worlds]))
     result: dict[str, Any] = {
@@ -164,7 +164,7 @@ def evaluate(worlds: Sequence[WorldViews], aerial: Any, ground: Any, max_queries
 
 
 def _digest(worlds: Sequence[WorldViews]) -> str:
-    """Return the hash of the worlds' arrays: the files themselves differ with the compression's version."""
+    """Return the hash of the worlds' arrays, as their files depend on the version of the compression."""
     total = hashlib.sha256()
     for world in worlds:
         for array in (world.aerial, world.queries, world.poses):
@@ -177,9 +177,9 @@ HEADINGS = 36
 
 _CELL = 2.0  # metres of the dense search
 _BEST = 5  # places kept
-_DISTINCT = 10.0  # metres between two places that are counted as two
-_MAX_ERROR = 10.0  # metres from the truth at which a place still counts as found
-_RADIUS = 29.0  # metres of a query that are compared
+_DISTINCT = 10.0  # least metres between two places
+_MAX_ERROR = 10.0  # metres from the truth within which a place counts as found
+_RADIUS = 29.0  # metres around a query's centre within which cells are compared
 
 Encoder = Callable[[Image], Features]
 
@@ -196,7 +196,7 @@ class SearchedQuery:
     scores: Floats  # (5,) of the places
 
     def found_among(self, best: int = 1) -> bool:
-        """Tell whether one of the ``best`` places lies within 10 m of the truth."""
+        """Return whether one of the ``best`` places lies within 10 m of the truth."""
         apart = np.linalg.norm(self.places[:best, :2] - self.pose[:2], axis=1)
         return bool((apart < _MAX_ERROR).any())
 
@@ -204,7 +204,7 @@ class SearchedQuery:
 def search_queries(
     worlds: Sequence[WorldViews], aerial: Encoder, ground: Encoder, max_queries: int | None = None
 ) -> list[SearchedQuery]:
-    """Search every query (up to ``max_queries`` of a world) in its world's map, at all places and headings."""
+    """Search every query (at most ``max_queries`` per world) in its world's map, at all places and headings."""
     yaws = np.arange(HEADINGS) * 2 * np.pi / HEADINGS
     results = []
     for number, world in enumerate(worlds):
@@ -224,7 +224,7 @@ def search_queries(
 
 
 def weights(sigma: Floats32) -> Floats32:
-    """Weigh a query's cells (h, h) by their uncertainty (h, h): 1 / sigma within 29 m of the middle."""
+    """Return weights (h, h) of a query's cells, 1 / sigma within 29 m of the centre, from sigma (h, h)."""
     at = np.arange(len(sigma)) + 0.5 - len(sigma) / 2
     return np.asarray((np.hypot(at[:, None], at[None]) < _RADIUS) / sigma, dtype=np.float32)
 

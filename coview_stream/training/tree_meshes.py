@@ -1,4 +1,4 @@
-"""Meshes of trees: crowns of several families and undergrowth, which let some rays pass, and wood, which stops all."""
+"""Meshes of trees: crowns of several families and undergrowth let some rays pass, wood stops all."""
 
 from __future__ import annotations
 
@@ -15,9 +15,9 @@ from coview_stream.training.trees import Terrain, Trees, waves
 class MeshCopies(NamedTuple):
     """Copies of a mesh."""
 
-    template: Mesh  # whose triangles all copies have
+    template: Mesh  # all copies have its triangles
     vertices: Floats  # (M, V, 3) metres
-    owner: Ints  # (M,) index of the tree, bush or other object that each copy belongs to
+    owner: Ints  # (M,) index of the tree, bush or other object of each copy
 
 
 def join_standing(parts: Iterable[MeshCopies], there: Bools, shift: Floats | None = None) -> Mesh:
@@ -36,7 +36,7 @@ def join_standing(parts: Iterable[MeshCopies], there: Bools, shift: Floats | Non
 def scaled_copies(
     rng: np.random.Generator, template: Mesh, centre: Floats, semi: Floats, rough: float, owner: Ints
 ) -> MeshCopies:
-    """Copy a template to (M, 3) centres, scaled by (M, 3), with vertices displaced by ``rough`` (a share), 1 sigma."""
+    """Copy a template to centres (M, 3), scaled by (M, 3), with vertices displaced by ``rough`` (a share), 1 sigma."""
     size = (len(centre), len(template.vertices), 1)
     vertices = template.vertices[None] * (1.0 + np.clip(rng.normal(0, rough, size), -0.6, 0.6))
     return MeshCopies(template, vertices * semi[:, None] + centre[:, None], owner)
@@ -55,7 +55,7 @@ _MAX_CLUMPS = 110_000  # in a stand
 
 
 def crowns(rng: np.random.Generator, trees: Trees) -> list[MeshCopies]:
-    """Draw the leaves of all trees, each of its own family."""
+    """Draw the leaves of all trees by their families."""
     parts: list[MeshCopies] = []
     for family, draw in enumerate((_lumpy, _cone, _storeys, _umbrella, _clumps, _column)):  # in the order of FAMILIES
         of = np.flatnonzero(trees.family == family)
@@ -69,7 +69,7 @@ def _lumpy(rng: np.random.Generator, trees: Trees, of: Ints) -> list[MeshCopies]
     semi = np.column_stack([wide, wide, depth])
     rough = rng.uniform(0.05, 0.25)
     parts = [scaled_copies(rng, _MAIN, trees.crown_axis(trees.base[of] + depth, of), semi, rough, of)]
-    for _ in range(int(rng.integers(0, 5))):  # boughs off the middle
+    for _ in range(int(rng.integers(0, 5))):  # boughs off the centre
         share, angle = rng.uniform(0.35, 0.65, len(of)), rng.uniform(0, 2 * np.pi, len(of))
         centre = trees.crown_axis(trees.base[of] + depth * rng.uniform(0.5, 1.5, len(of)), of)
         out = 0.7 * wide * rng.uniform(0.6, 1.2, len(of))
@@ -98,7 +98,7 @@ def _storeys(rng: np.random.Generator, trees: Trees, of: Ints) -> list[MeshCopie
 
 
 def _leaning(part: MeshCopies, trees: Trees) -> MeshCopies:
-    """Shear copies, from their lowest vertex up, by their trees' lean."""
+    """Shear copies by the lean of their trees, from the lowest vertex up."""
     low = part.vertices[:, :, 2].min(axis=1, keepdims=True)
     up = (part.vertices[:, :, 2] - low)[:, :, None]
     part.vertices[:, :, :2] += up * trees.lean[part.owner][:, None]
@@ -143,7 +143,7 @@ def _clumps(rng: np.random.Generator, trees: Trees, of: Ints) -> list[MeshCopies
 
 
 def bushes(rng: np.random.Generator, terrain: Terrain, density: float) -> MeshCopies:
-    """Draw the understory, each bush its own owner: in patches, up to 3 m high, ``density`` per square metre."""
+    """Draw the understory in patches, up to 3 m high, ``density`` per square metre, each bush its own owner."""
     xy = rng.uniform(-terrain.half, terrain.half, (int(1.7 * density * (2 * terrain.half) ** 2), 2))
     patchy = rng.uniform(0, 3) * waves(rng, rng.uniform(15, 60))(*xy.T)
     xy = xy[rng.random(len(xy)) < 1 / (1 + np.exp(-0.4 - patchy))]
@@ -156,7 +156,7 @@ def bushes(rng: np.random.Generator, terrain: Terrain, density: float) -> MeshCo
 
 
 def tubes(begin: Floats, end: Floats, radius: Floats, top: Floats, sides: int, owner: Ints) -> MeshCopies:
-    """Make tubes between (M, 3) points, their radius falling from ``radius`` to ``top`` (M,), metres."""
+    """Return tubes between points (M, 3) that taper from ``radius`` to ``top`` (M,), metres."""
     axis = end - begin
     axis = axis / np.maximum(np.linalg.norm(axis, axis=1), 1e-9)[:, None]
     aside = np.where(np.abs(axis[:, 2:]) < 0.9, [[0.0, 0.0, 1.0]], [[1.0, 0.0, 0.0]])
@@ -175,14 +175,14 @@ def tubes(begin: Floats, end: Floats, radius: Floats, top: Floats, sides: int, o
 
 
 def stems(trees: Trees) -> MeshCopies:
-    """Make leaning, tapering stems, from half a metre below the ground to near the top."""
+    """Return leaning, tapering stems from half a metre below the ground to near the top."""
     top = trees.axis(0.93 * trees.height)
     foot = trees.axis(np.full(len(trees.x), -0.5))
     return tubes(foot, top, trees.radius, 0.25 * trees.radius, 6, np.arange(len(trees.x)))
 
 
 def branches(rng: np.random.Generator, trees: Trees, count: Ints) -> MeshCopies:
-    """Draw ``count`` (N,) branches of each tree: within its crown, some dead ones below."""
+    """Draw ``count`` (N,) branches of each tree inside its crown, and some dead branches below."""
     owner = np.repeat(np.arange(len(trees.x)), count)
     low, height = 0.7 * trees.base[owner], trees.height[owner]
     at = low + (0.95 * height - low) * rng.random(len(owner))

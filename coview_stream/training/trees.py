@@ -1,4 +1,4 @@
-"""Ground of a forest and its trees: places, species and sizes, drawn at random."""
+"""Random forests: the ground, and the places, species and sizes of the trees."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ _STEP = 1.0  # metres between grid points
 
 
 def waves(rng: np.random.Generator, wavelength: float, count: int = 8) -> Field:
-    """Draw a smooth function of x and y (N,) with mean 0, variance 1 and about this wavelength, metres."""
+    """Draw a smooth function of x and y (N,) with mean 0, variance 1 and about the given wavelength, metres."""
     heading, phase = rng.uniform(0, 2 * np.pi, (2, count))
     number = 2 * np.pi / (wavelength * rng.uniform(0.7, 1.4, count))
     kx, ky = number * np.cos(heading), number * np.sin(heading)
@@ -36,7 +36,7 @@ def waves(rng: np.random.Generator, wavelength: float, count: int = 8) -> Field:
 class Terrain:
     """A square of ground, +-``half`` metres about the origin.
 
-    ``slope`` (degrees) is exceeded on 5 % of it, without the roughness; ``roughness`` is in metres.
+    Without ``roughness`` (metres), ``slope`` (degrees) is exceeded on 5 % of the area.
     """
 
     def __init__(self, rng: np.random.Generator, half: float, slope: float, roughness: float) -> None:
@@ -46,7 +46,7 @@ class Terrain:
         heading, share = rng.uniform(0, 2 * np.pi), rng.uniform(0, 0.7)
         tilted = share * (X * np.cos(heading) + Y * np.sin(heading))
         z = np.zeros_like(X)
-        shortness = rng.uniform(0.7, 1.6)  # exponent by which longer waves are higher
+        shortness = rng.uniform(0.7, 1.6)  # exponent of the wavelength in the amplitude
         for wavelength in (220.0, 110.0, 55.0, 27.0):
             z += wavelength**shortness * rng.uniform(0.2, 1.0) * waves(rng, wavelength, 5)(X, Y)
         z = tilted + (1 - share) * z / _steepness(z)
@@ -55,7 +55,7 @@ class Terrain:
         self._heights: Floats = z - z.mean() + roughness * bumps / bumps.std()
 
     def z(self, x: Floats, y: Floats) -> Floats:
-        """Return the height of the ground (N,) at (N,) coordinates, metres."""
+        """Return the ground height (N,) at coordinates (N,), metres."""
         scale = (len(self._axis) - 1) / (2 * self.half)
         at = (np.stack([np.asarray(x), np.asarray(y)]) + self.half) * scale
         return np.asarray(map_coordinates(self._heights, at, order=1, mode="nearest"))
@@ -84,7 +84,7 @@ _MIN_SPACING = 0.8  # metres between two stems
 
 
 class Species(NamedTuple):
-    """Tree species: family of its crowns; crown diameter, lowest leaves and stem radius in shares of the height."""
+    """Tree species: crown family; crown diameter, lowest leaves and stem radius as shares of the height."""
 
     family: str
     width: float
@@ -104,7 +104,7 @@ class Trees(NamedTuple):
     crown: Floats  # radius of the crown
     base: Floats  # height of the lowest leaves above the foot
     lean: Floats  # (N, 2) metres per metre of height
-    offset: Floats  # (N, 2) of the crown's middle from the stem's axis
+    offset: Floats  # (N, 2) of the crown's centre from the stem's axis
     family: Ints  # index into FAMILIES
     evergreen: Bools  # whether it keeps its leaves in winter
     dead: Bools  # whether it is bare
@@ -116,7 +116,7 @@ class Trees(NamedTuple):
         return np.column_stack([xy, self.z[of] + up])
 
     def crown_axis(self, up: Floats, of: Ints | slice = slice(None)) -> Floats:
-        """Return points (M, 3) in the middle of the crowns, ``up`` (M,) metres above their feet."""
+        """Return points (M, 3) on the axes of the crowns, ``up`` (M,) metres above their feet."""
         xy = np.column_stack([self.x[of], self.y[of]]) + self.lean[of] * up[:, None] + self.offset[of]
         return np.column_stack([xy, self.z[of] + up])
 
@@ -133,7 +133,7 @@ def draw_species(rng: np.random.Generator, recipe: Recipe) -> list[Species]:
 
 
 def draw_trees(rng: np.random.Generator, recipe: Recipe, terrain: Terrain, xy: Floats, species: list[Species]) -> Trees:
-    """Draw the sizes of trees that stand at (N, 2)."""
+    """Draw the sizes of trees at places (N, 2)."""
     count = len(xy)
     # species grow in patches, or mixed
     scores = [
@@ -165,12 +165,12 @@ def draw_trees(rng: np.random.Generator, recipe: Recipe, terrain: Terrain, xy: F
 
 
 def _crowns(rng: np.random.Generator, recipe: Recipe, share: Floats, height: Floats, area: float) -> Floats:
-    """Draw radii (N,) of crowns, metres, from their usual ``share`` of the height; half of the stands are closed."""
+    """Draw crown radii (N,), metres, from their usual ``share`` of the height; half of the stands are closed."""
     low, high = (width * height / 2 for width in recipe.crown_width)
     wide = share * rng.lognormal(0, 0.15, len(height)) * height / 2
     if rng.random() < 0.5:
         wide = wide * np.sqrt(rng.uniform(0.7, 2.0) * area / max(float((np.pi * wide**2).sum()), 1.0))
-    # where trees are dense their crowns stay narrow
+    # dense trees have narrow crowns
     room = max(0.6, rng.uniform(0.8, 1.8) * float(np.sqrt(area / max(len(height), 1))) / 2)
     return np.minimum(np.clip(wide, low, high), room * rng.uniform(0.85, 1.15, len(height)))
 
@@ -209,7 +209,7 @@ def draw_stems(rng: np.random.Generator, pattern: str, per_hectare: float, half:
 
 
 def _spaced(rng: np.random.Generator, xy: Floats, apart: float) -> Bools:
-    """Mask (N,) out the lower-ranked stem of each pair nearer than ``apart``; ranks are random."""
+    """Return a mask (N,) without the lower-ranked stem of each pair nearer than ``apart``; ranks are random."""
     keep = np.ones(len(xy), dtype=bool)
     pairs = cKDTree(xy).query_pairs(apart, output_type="ndarray")
     rank = rng.random(len(xy))
@@ -218,7 +218,7 @@ def _spaced(rng: np.random.Generator, xy: Floats, apart: float) -> Bools:
 
 
 def opened(rng: np.random.Generator, xy: Floats, half: float) -> Bools:
-    """Mask (N,) the stems left by thin parts, gaps and perhaps a trail."""
+    """Mask (N,) the stems that remain after thin parts, gaps and perhaps a trail."""
     keep = np.ones(len(xy), dtype=bool)
     if rng.random() < 0.6:
         uneven = waves(rng, rng.uniform(40, 120))(xy[:, 0], xy[:, 1])

@@ -1,4 +1,4 @@
-"""Training worlds: a place at two times, the map's scan, the robot's submaps, and their bird's-eye views on disk."""
+"""Training worlds: a site at two times, the map's scan, the robot's submaps, and their bird's-eye views on disk."""
 
 from __future__ import annotations
 
@@ -40,13 +40,13 @@ class World:
 
     size: float  # side of the square map about the origin, metres
     kind: str  # forest type or kind of scene, in words
-    mapped: SceneState  # the place when the map is scanned
-    now: SceneState  # the place when the robot drives
-    ground: Callable[[Floats, Floats], Floats]  # heights (N,) of the ground at x and y (N,), metres
+    mapped: SceneState  # geometry when the map is scanned
+    now: SceneState  # geometry when the robot drives
+    ground: Callable[[Floats, Floats], Floats]  # ground heights (N,) at x and y (N,), metres
     span: tuple[float, float]  # lowest and highest ground, metres
     # (random numbers, greatest distance from the origin in x and y, length) -> path (N, 2), metres
     path: Callable[[np.random.Generator, float, float], Floats]
-    drawn: dict[str, Any]  # values that were drawn for it, for JSON
+    drawn: dict[str, Any]  # values that were drawn for the world, for JSON
 
 
 def draw_world(seed: int, recipe: Recipe) -> World:
@@ -82,7 +82,7 @@ def draw_world(seed: int, recipe: Recipe) -> World:
 
 
 def base_scan(world: World, seed: int, recipe: Recipe) -> tuple[Points, dict[str, float]]:
-    """Scan the map from the air: (N, 3) float32 metres, one point per voxel, and the values drawn for the flight."""
+    """Scan the map from the air; return (N, 3) float32 metres, one point per voxel, and the flight's drawn values."""
     rng = np.random.default_rng([seed, _FLIGHT])
     names = "pulses altitude swath aerial_noise aerial_porosity leaf_depth strip_shift strip_lift"
     drawn = {name: recipe.draw(rng, name) for name in names.split()}
@@ -104,7 +104,7 @@ def base_scan(world: World, seed: int, recipe: Recipe) -> tuple[Points, dict[str
 
 
 def drives(world: World, seed: int, recipe: Recipe) -> Iterator[tuple[str, Frames]]:
-    """Drive through the world ``recipe.submaps`` times; yields the sensor's name and its frames."""
+    """Drive through the world ``recipe.submaps`` times; yield the sensor's name and its frames."""
     rng = np.random.default_rng([seed, _DRIVES])
     caster = Caster(world.now, threads=1, leaf_depth=recipe.draw(rng, "leaf_depth"))
     porosity = recipe.draw(rng, "ground_porosity")
@@ -137,7 +137,7 @@ class WorldViews:
 
     aerial: Image  # (LAYERS, H, W) the map
     corner: Floats  # (2,) of the map's cell (0, 0), metres
-    queries: npt.NDArray[np.uint8]  # (K, LAYERS, QUERY_CELLS, QUERY_CELLS), each about the robot
+    queries: npt.NDArray[np.uint8]  # (K, LAYERS, QUERY_CELLS, QUERY_CELLS), each centred on the robot
     poses: Floats  # (K, 3) x, y, yaw of the queries: p_world = R(yaw) p_query + (x, y), metres and radians
     sensor: npt.NDArray[np.str_]  # (K,) names
     kind: str  # of the world, in words
@@ -146,7 +146,7 @@ class WorldViews:
 
 
 def world_views(seed: int, recipe: Recipe) -> WorldViews:
-    """Draw the world of a seed, and its views."""
+    """Draw the views of a seed's world."""
     world = draw_world(seed, recipe)
     base, flight = base_scan(world, seed, recipe)
     cells, corner = round(world.size / CELL), np.full(2, -world.size / 2)
@@ -165,11 +165,7 @@ def world_views(seed: int, recipe: Recipe) -> WorldViews:
 
 
 def write_world(path: str | os.PathLike[str], seed: int, recipe: Recipe) -> None:
-    """Write the world of a seed; the file is complete or not there.
-
-    Raises:
-        InputError: the file cannot be written.
-    """
+    """Write the views of a seed's world atomically; InputError if the file cannot be written."""
     views = world_views(seed, recipe)
     fields = {name: getattr(views, name) for name in _KEYS} | {"recipe": json.dumps(views.recipe)}
     try:
@@ -183,7 +179,7 @@ def read_world(path: str | os.PathLike[str]) -> WorldViews:
     """Read a file of :func:`write_world`.
 
     Raises:
-        InputError: there is no such file, or it holds no views of a world.
+        InputError: the file does not exist, or holds no views of a world.
     """
     try:
         with np.load(Path(path), allow_pickle=False) as file:
@@ -201,9 +197,9 @@ def write_dataset(
     workers: int = 1,
     progress: Callable[[int, float], None] | None = None,
 ) -> list[Path]:
-    """Write ``SEED.npz`` for each seed into a directory, and return the files in that order; existing files stay.
+    """Write ``SEED.npz`` for each seed into a directory, and return the files in this order; existing files stay.
 
-    ``progress`` is called with the seed and the seconds it took, when one of the processes has written a file.
+    ``progress`` is called after each file with its seed and the seconds it took.
 
     Raises:
         InputError: the directory or a file cannot be written.
@@ -217,7 +213,7 @@ def write_dataset(
     missing = [seed for seed, path in paths.items() if not path.exists()]
     report = progress or (lambda seed, seconds: None)
     write = partial(_timed, directory, recipe)
-    # Open3D in a forked process may hang on the threads of its parent
+    # spawn processes: in a forked one Open3D may hang on the threads of its parent
     with closing(ProcessExecutor(workers) if workers > 1 else Executor()) as executor:
         for number, seconds in executor.run(write, missing):
             if isinstance(seconds, Exception):

@@ -1,4 +1,4 @@
-"""Dirt of the real world in simulated ones: each kind is an option, and has its own random numbers."""
+"""Dirt of the real world in simulated worlds; each kind is an option with its own random numbers."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Dirt of the real world: its kinds, and the strength of each."""
+"""Kinds of dirt of the real world, and their strengths."""
 
 from __future__ import annotations
 
@@ -20,23 +20,23 @@ REAL = "real"
 class Dirt:
     """Dirt in a simulated world; each kind is None (off) or its settings.
 
-    The truth that is written stays the true pose of the body.
+    The written truth stays the true pose of the body.
 
     Raises:
         ConfigError: a value out of its range, here or in one of the kinds.
     """
 
-    seed: int = 0  # of all that is drawn for dirt, besides the world's own seed
+    seed: int = 0  # of all random numbers for dirt, in addition to the world's own seed
     motion: Motion | None = None  # raw sweeps of a moving robot, deskewed by its odometry
     traffic: Traffic | None = None  # people and vehicles that move
-    rain: Rain | None = None  # returns of drops
-    dust: Dust | None = None  # returns of a cloud behind the robot
+    rain: Rain | None = None  # returns from drops
+    dust: Dust | None = None  # returns from a cloud behind the robot
     beams: Beams | None = None  # noise that grows with the range, mixed echoes at edges
     reflectors: Reflectors | None = None  # signs that bloom
-    glass: Glass | None = None  # windows that mirror or let through
+    glass: Glass | None = None  # windows that mirror beams or let them pass
     mounting: Mounting | None = None  # a leaning, displaced sensor
-    gravity: Gravity | None = None  # a false direction of down in the odometry
-    odometry: Miscalibration | None = None  # wrong scale and a turning heading
+    gravity: Gravity | None = None  # a wrong gravity direction in the odometry
+    odometry: Miscalibration | None = None  # wrong scale and a drifting heading
     slip: Slip | None = None  # bursts of slipping wheels
     strips: Strips | None = None  # survey strips that disagree
     density: Density | None = None  # an uneven density of the survey
@@ -69,7 +69,7 @@ class Dirt:
 
 
 class Strength(NamedTuple):
-    """Dataclass of a kind of dirt, its field that a number on the command line sets, and the number's meaning."""
+    """Dataclass of a kind of dirt, the field that a number on the command line sets, and its meaning."""
 
     settings: Any
     field: str
@@ -95,7 +95,7 @@ STRENGTHS: dict[str, Strength] = {
     "grass": Strength(Grass, "height", "m of the tallest grass"),
     "snow": Strength(Snow, "depth", "m of snow off the roads"),
 }
-"""For each kind its settings, and the one that a number after its name on the command line sets."""
+"""Settings of each kind, and the field that a number after its name on the command line sets."""
 
 KINDS_OF_DIRT = tuple(STRENGTHS)
 """Names of all kinds of dirt."""
@@ -106,14 +106,14 @@ _ON_SENSOR = frozenset(
 
 
 def real(seed: int = 0) -> Dirt:
-    """Return all kinds of dirt at once, each with its default strength: the worst of all seasons in one run."""
+    """Return all kinds of dirt at once with their default strengths: the worst of all seasons in one run."""
     return Dirt(seed, **{name: strength.settings() for name, strength in STRENGTHS.items()})
 
 
 def parse_dirt(text: str, seed: int = 0) -> Dirt:
-    """Return the dirt that a list such as ``rain,snow:0.4`` names; ``real`` is all of them.
+    """Parse a list of dirt such as ``rain,snow:0.4``; ``real`` is all kinds.
 
-    A number after a colon sets the kind's first setting; ``real,snow:0.1`` changes one of all.
+    A number after a colon sets the kind's first setting; ``real,snow:0.1`` changes one of all kinds.
 
     Raises:
         ConfigError: an unknown kind, a word for a number, or a number out of its range.

@@ -16,9 +16,9 @@ from coview_stream.sim.sensors import FRAME_PERIOD
 
 @dataclass(frozen=True)
 class Miscalibration:
-    """Constant errors of odometry over a run, and a heading that walks."""
+    """Constant errors of odometry over a run, and a random walk of the heading."""
 
-    scale: float = 0.05  # share by which distances are over- or underrated; the sign is drawn
+    scale: float = 0.05  # share by which distances are over- or underestimated; the sign is drawn
     yaw_rate: float = 0.05  # constant error of the heading, degrees per metre driven; the sign is drawn
     yaw_walk: float = 0.5  # random walk of the heading, degrees per square root of a metre, one sigma
 
@@ -36,12 +36,12 @@ class Miscalibration:
 
 @dataclass(frozen=True)
 class Slip:
-    """Bursts of slipping wheels: distance counted but not driven, or driven but not counted, and a false turn."""
+    """Bursts of wheel slip: distance counted but not driven, or driven but not counted, and a false turn."""
 
     share: float = 0.5  # of a burst's distance that is counted too much (spinning) or too little (skidding), at random
     turn: float = 4.0  # false turn in a burst, degrees, one sigma
     length: float = 1.5  # of a burst, metres driven
-    every: float = 25.0  # mean distance from burst to burst, metres driven
+    every: float = 25.0  # mean distance between bursts, metres driven
 
     def __post_init__(self) -> None:
         within(self, share=(0.0, 1.0), turn=(0.0, 90.0), length=(0.1, 100.0), every=(0.1, 1e4))
@@ -59,17 +59,17 @@ class Slip:
         return spoilt(odometry, _about_z(np.radians(np.cumsum(turns))), factors)
 
     def bursts(self, way: float, rng: np.random.Generator) -> Floats:
-        """Draw the metres driven at which slipping begins on a way of ``way`` metres: evenly spread, at least once."""
+        """Draw the metres driven at which slip begins on a path of ``way`` metres: uniform, at least once."""
         count = max(1, round(way / self.every))
         return (np.arange(count) + rng.uniform(0.2, 0.8, count)) * way / count
 
 
 @dataclass(frozen=True)
 class Gravity:
-    """Error of the inertial unit's direction of down: constant in size, slowly turning."""
+    """Error of the inertial unit's gravity direction, constant in size and slowly rotating."""
 
-    error: float = 0.5  # angle between the true and the assumed direction of down, degrees
-    period: float = 300.0  # seconds in which the false direction goes once round
+    error: float = 0.5  # angle between the true and the estimated gravity direction, degrees
+    period: float = 300.0  # seconds per rotation of the wrong direction
 
     def __post_init__(self) -> None:
         within(self, error=(0.0, 45.0), period=(1.0, 1e6))
@@ -83,7 +83,7 @@ class Gravity:
 
 
 def spoilt(odometry: Floats, turns: Floats, factors: Floats, first: Floats | None = None) -> Floats:
-    """Return poses (N, 4, 4) chained from spoilt motions of ``odometry`` (N, 4, 4), ``T_odom_body``.
+    """Chain spoilt motions of ``odometry`` (N, 4, 4), ``T_odom_body``, to poses (N, 4, 4).
 
     ``turns`` (N - 1, 3, 3) rotate the odometry's axes after each motion, ``first`` (3, 3) at the first pose;
     ``factors`` (N - 1,) scale each motion.
@@ -107,10 +107,10 @@ def _driven(odometry: Floats) -> Floats:
 
 @dataclass(frozen=True)
 class Mounting:
-    """Uncalibrated mounting: the sensor's points are sent as the body's."""
+    """Uncalibrated mounting: points in the sensor frame are sent as points in the body frame."""
 
-    lean: float = 2.0  # angle between the vertical axes of sensor and body, degrees; the side it leans to is drawn
-    yaw: float = 0.0  # turn about the vertical, degrees, one sigma; no map shows it on a straight road
+    lean: float = 2.0  # angle between the vertical axes of sensor and body, degrees; its direction is drawn
+    yaw: float = 0.0  # rotation about the vertical, degrees, one sigma; no map reveals it on a straight road
     lever: float = 0.05  # distance between sensor and body, metres; its direction is drawn
 
     def __post_init__(self) -> None:
@@ -124,29 +124,29 @@ class Mounting:
         return pose_from(R, self.lever * offset / np.linalg.norm(offset))
 
 
-_STEPS = 200  # true poses along a sweep: every 0.5 ms
+_STEPS = 200  # true poses along a sweep, every 0.5 ms
 _NS = 1e9
 
 
 @dataclass(frozen=True)
 class Motion:
-    """Raw sweeps: each lasts from one stamp to the next and bears the stamp of its end."""
+    """Raw sweeps, each from one stamp to the next, stamped at its end."""
 
-    rate: float = 50.0  # samples of odometry a second, by which the sweeps are deskewed
-    deskewed: bool = True  # whether the frames are deskewed, by the product's own code; if not they stay bent
+    rate: float = 50.0  # odometry samples per second for deskewing
+    deskewed: bool = True  # whether the product's code deskews the frames; if not they stay distorted
 
     def __post_init__(self) -> None:
         within(self, rate=(10.0, 1000.0))
 
 
 class Track:
-    """Smooth motion through the poses of a run's frames, true and by odometry.
+    """Smooth motion through the true and the odometry poses of a run's frames.
 
-    The robot passes the frames' poses at their stamps; the error of odometry grows evenly from frame to frame.
+    The robot passes the frames' poses at their stamps; between frames the odometry error grows linearly.
     """
 
     def __init__(self, stamps: Floats, T_scene_body: Poses, T_odom_body: Poses) -> None:
-        """Lay the track through (N,) stamps in seconds and (N, 4, 4) poses; it begins a frame before the first."""
+        """Fit the track to stamps (N,) in seconds and poses (N, 4, 4); it begins one frame before the first."""
         from scipy.interpolate import CubicSpline
         from scipy.spatial.transform import Rotation, RotationSpline
 
@@ -182,17 +182,17 @@ class Track:
         return self.true(self.stamps[frame] + grid), np.clip(nearest, 0, _STEPS - 1)
 
     def segment(self, frame: int, rate: float) -> Segment:
-        """Return the odometry of a sweep, ``rate`` samples a second."""
+        """Return the odometry of a sweep at ``rate`` samples per second."""
         count = round(FRAME_PERIOD * rate) + 1
         stamps = self.stamps[frame] + np.linspace(-FRAME_PERIOD, 0.0, count)
         return Segment(np.rint(stamps * _NS).astype(np.int64), self.odom(stamps))
 
     def straightened(self, frame: int, points: Points, times: Floats, rate: float) -> Points:
-        """Deskew a sweep's points (N, 3) by the odometry, as a node does."""
+        """Deskew a sweep's points (N, 3) by odometry, as a node does."""
         stamp_ns = round(float(self.stamps[frame]) * _NS)
         return deskew(points, times, self.segment(frame, rate), stamp_ns, self.odometry[frame])
 
 
 def beam_times(count: int) -> Floats:
-    """Return the times (N,) of a sweep's beams in seconds after its stamp, the sweep's end."""
+    """Return the times (N,) of a sweep's beams in seconds relative to its stamp, the end of the sweep."""
     return np.asarray((np.arange(1, count + 1) / count - 1.0) * FRAME_PERIOD)

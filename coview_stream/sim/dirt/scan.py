@@ -1,4 +1,4 @@
-"""Scans of a robot with dirt: from beams to deskewed frames, and the recording of raw sweeps."""
+"""Robot scans with dirt, from beams to deskewed frames, and the recording of raw sweeps."""
 
 from __future__ import annotations
 
@@ -27,11 +27,11 @@ from coview_stream.sim.sensors import POROSITY, RANGE_NOISE, MeshCaster, Sensor
 CLOUDS, ODOMETRY = "/points", "/odom"
 """Topics of the recording."""
 
-_BAG_VERSION = 9  # of rosbag2's metadata, which the ROS of today reads
+_BAG_VERSION = 9  # of rosbag2's metadata, readable by current ROS
 
 
 class Recording:
-    """A rosbag2 directory (mcap) that is being written; a context manager."""
+    """Writer of a rosbag2 directory (mcap); a context manager."""
 
     def __init__(self, path: Path) -> None:
         from rosbags.rosbag2 import StoragePlugin, Writer
@@ -50,9 +50,9 @@ class Recording:
         self._writer.close()
 
     def add(self, points: Points, times: Floats, segment: Segment) -> None:
-        """Add a sweep that bears the stamp of its segment's end, and new samples of the segment's odometry before it.
+        """Add new odometry samples of a segment, then a sweep stamped at the segment's end.
 
-        ``points`` (N, 3) float32 metres are each in the sensor frame at their ``times`` (N,), seconds after the stamp.
+        ``points`` (N, 3) float32 metres are in the sensor frame at their ``times`` (N,), seconds relative to the stamp.
         """
         for stamp, pose in zip(segment.stamps.tolist(), segment.poses, strict=True):
             if stamp > self._newest:
@@ -65,12 +65,12 @@ class Recording:
 
 
 class Stream(IntEnum):
-    """Purposes that draw random numbers."""
+    """Purposes with their own random numbers."""
 
     COVER, GLASS, TRAFFIC, MOUNTING, BEAMS, WEATHER, ODOMETRY, SLIP, GRAVITY, STRIPS, DENSITY, YEARS = range(1, 13)
 
 
-_DIRT = 200  # apart from the streams of scene, flight and drive
+_DIRT = 200  # distinct from the streams of scene, flight and drive
 
 
 def stream(world_seed: int, seed: int, purpose: Stream) -> np.random.Generator:
@@ -87,16 +87,16 @@ _CONIFER = vegetation.TREE_COLUMNS.index("conifer")
 class Echoes(NamedTuple):
     """Echoes of (N,) beams."""
 
-    distance: Floats  # (N,) metres that the beam counts; inf without a return
-    strength: Floats  # (N,) cosine of the incidence, less the loss at glass
+    distance: Floats  # (N,) measured range, metres; inf without a return
+    strength: Floats  # (N,) cosine of the incidence, reduced by the loss at glass
     signs: Bools  # (N,) whether a retro-reflecting sign returned it
 
 
 class Surfaces:
-    """Scene for the robot's beams, with the cover of its ground and with windows in some walls."""
+    """Scene for the robot's beams, with ground cover and with windows in some walls."""
 
     def __init__(self, scene: Scene, cover: Cover | None, glass: Glass | None, rng: np.random.Generator) -> None:
-        """Use the present state of the scene; ``rng`` draws the buildings with windows."""
+        """Take the present state of the scene; ``rng`` draws the buildings with windows."""
         self._site, self._cover, self._glass = scene.site, cover, glass
         parts = drawn_parts(scene)[1]
         with_windows = rng.random(len(scene.houses)) < (0.0 if glass is None else glass.share)
@@ -137,7 +137,7 @@ class Surfaces:
 
 
 def seasonal_caster(parts: Parts, scene: Scene, seasons: Seasons) -> MeshCaster:
-    """Return the caster of a survey in winter: broad-leaved trees and bushes are bare."""
+    """Return the caster of a winter survey, in which broad-leaved trees and bushes are bare."""
     below = scene.site.z(parts.trees[:, 0], parts.trees[:, 1])
     conifers = parts.trees[:, _CONIFER] > 0.5
     green = vegetation.crowns(parts.trees[conifers], below[conifers])
@@ -147,7 +147,7 @@ def seasonal_caster(parts: Parts, scene: Scene, seasons: Seasons) -> MeshCaster:
 
 
 class Scanner:
-    """Lidar in a dirty world; read frames in order, they share random numbers."""
+    """Lidar in a dirty world; read frames in order, as they share random numbers."""
 
     def __init__(
         self,
@@ -158,7 +158,7 @@ class Scanner:
         rng: Callable[[Stream], np.random.Generator],
         mount: Mount = Mount(),  # noqa: B008 - immutable
     ) -> None:
-        """Use the present scene; ``rng`` gives the random numbers of a purpose, ``height`` is the sensor's."""
+        """Take the present scene; ``rng`` gives the random numbers of a purpose, ``height`` is the sensor's."""
         self._sensor, self._dirt, self._height, self._mount = sensor, dirt, height, mount
         covered = dirt.snow is not None or dirt.grass is not None
         cover = Cover(scene.site, dirt.snow, dirt.grass, rng(Stream.COVER)) if covered else None
@@ -171,9 +171,9 @@ class Scanner:
     def frames(
         self, stamps: Floats, T_scene_body: Poses, T_odom_body: Poses, recording: Recording | None = None
     ) -> Iterator[Points]:
-        """Yield frames (N, 3) float32 metres, in the sensor's frame, at stamps (N,), seconds.
+        """Yield frames (N, 3) float32 metres, in the sensor frame, at stamps (N,), seconds.
 
-        The odometry (N, 4, 4) deskews raw sweeps, which ``recording`` takes as well where the robot moves meanwhile.
+        The odometry (N, 4, 4) deskews raw sweeps; ``recording`` also gets them if the dirt includes motion.
         """
         motion = None if self._sensor.stop else self._dirt.motion
         track = None if motion is None else Track(stamps, T_scene_body, T_odom_body)
@@ -188,9 +188,9 @@ class Scanner:
             yield points
 
     def sweep(self, frame: int, T_scene_body: Pose, track: Track | None, seconds: float) -> tuple[Points, Floats]:
-        """Return points (N, 3) in the sensor frame at their times, and the times (N,), seconds after the stamp.
+        """Return points (N, 3) in the sensor frame at their times, and the times (N,), seconds relative to the stamp.
 
-        The stamp is ``seconds`` after the first one. Without a track all beams leave at once, at the stamp.
+        The stamp is ``seconds`` after the first stamp. Without a track all beams are fired at the stamp.
         """
         rays = self._sensor.beams(frame)
         times = beam_times(len(rays))
@@ -216,7 +216,7 @@ class Scanner:
         return (rays[detected] * noisy[detected, None]).astype(np.float32), times[detected]
 
     def _echoes(self, origins: Floats32, rays: Floats, towards: Floats, moving: MeshCaster | None) -> Echoes:
-        """Return the echoes of beams of finite width, unit ``rays`` (N, 3) in the sensor frame."""
+        """Return the echoes of beams of finite width along unit ``rays`` (N, 3) in the sensor frame."""
         first = self._met(origins, _turned(towards, rays), moving)
         if (beams := self._dirt.beams) is not None:
             second = self._met(origins, _turned(towards, beams.aside(rays, self._rng)), moving)
@@ -239,7 +239,7 @@ class Scanner:
         return Echoes(distance, np.where(nearer, met.incidence, surfaces.strength), surfaces.signs & ~nearer)
 
     def _weather(self, echoes: Echoes, rays: Floats) -> Floats:
-        """Return the ranges (N,) of the nearest of surfaces, drops and dust; drops and dust always return."""
+        """Return the range (N,) of the nearest surface, drop or dust; drops and dust always return."""
         distance = echoes.distance
         in_air = np.full(len(rays), np.inf)
         if self._dirt.rain is not None:

@@ -16,13 +16,13 @@ from coview_stream.sim.mesh import EMPTY, Mesh, cylinder, ellipsoid, join, place
 from coview_stream.sim.scenes import Parts, Scene
 
 _VERGE = 1.0  # metres beside the carriageway without grass
-_STEEPEST = 0.05  # cosine of the incidence: bounds the way of flat rays through the cover
+_STEEPEST = 0.05  # least cosine of the incidence: bounds the path of flat rays through the cover
 _WAVES = ((23.0, 0.6), (9.0, 0.4))  # metres and share: drifts and tussocks
 
 
 @dataclass(frozen=True)
 class Snow:
-    """Snow on the ground, after the survey; the robot's wheels sink through it."""
+    """Snow on the ground after the survey; the robot's wheels sink through it."""
 
     depth: float = 0.25  # metres, off the roads
     on_roads: float = 0.5  # share of the depth that lies on the carriageway
@@ -34,10 +34,10 @@ class Snow:
 
 @dataclass(frozen=True)
 class Grass:
-    """Tall grass off the roads, after the survey: beams enter it and end somewhere within."""
+    """Tall grass off the roads after the survey; beams enter it and end somewhere inside."""
 
-    height: float = 0.35  # metres, of the tallest
-    reach: float = 0.3  # mean way of a beam through it, metres
+    height: float = 0.35  # of the tallest, metres
+    reach: float = 0.3  # mean path of a beam through it, metres
     tussocks: float = 0.5  # share by which the height varies
 
     def __post_init__(self) -> None:
@@ -45,7 +45,7 @@ class Grass:
 
 
 class Cover:
-    """Snow and grass on the ground of a scene; the deeper of them where both are."""
+    """Snow and grass on the ground of a scene; where both are, the deeper one counts."""
 
     def __init__(self, site: Site, snow: Snow | None, grass: Grass | None, rng: np.random.Generator) -> None:
         self._site, self._snow, self._grass = site, snow, grass
@@ -77,9 +77,9 @@ class Cover:
         return total
 
     def sink(self, x: Floats, y: Floats, incidence: Floats, rng: np.random.Generator) -> Floats:
-        """Return the metres (N,) that beams go on below the cover's surface at coordinates (N,).
+        """Return the metres (N,) that beams travel below the cover's surface at coordinates (N,).
 
-        Snow stops a beam at once; in grass it goes ``reach`` metres on average, and to the ground at most.
+        Snow stops a beam at once; in grass it travels ``reach`` metres on average, at most to the ground.
         ``incidence`` is the cosine of the angle of incidence.
         """
         if self._grass is None:
@@ -90,18 +90,18 @@ class Cover:
         return np.where(ends, np.clip(rng.exponential(self._grass.reach, len(x)), 0.0, np.maximum(through, 0.0)), 0.0)
 
 
-_GONE, _NEW, _REBUILT = 0.01, 0.01, 0.005  # share of the buildings a year
-_FELLED = 0.015  # share of the trees a year, and as many new ones
-_GROWTH = 0.12  # metres a year that a tree grows
-_SMALLEST = 0.6  # least share of its present height that a tree had
+_GONE, _NEW, _REBUILT = 0.01, 0.01, 0.005  # share of the buildings per year
+_FELLED = 0.015  # share of the trees per year; the same number is planted
+_GROWTH = 0.12  # metres per year
+_SMALLEST = 0.6  # least height of a tree at the survey, as a share of its present height
 
 
 @dataclass(frozen=True)
 class Years:
     """Years between the survey and the run.
 
-    Buildings were demolished, built, and replaced by others, at least one of each; trees were felled and planted and
-    have grown; other cars are parked.
+    Buildings were demolished, built and replaced, at least one each; trees were felled, planted and have grown; other
+    cars are parked.
     """
 
     years: float = 10.0  # between survey and run
@@ -112,7 +112,7 @@ class Years:
 
 @dataclass(frozen=True)
 class Seasons:
-    """Seasons: the survey saw bare trees and bushes, the robot sees leaves. Conifers stay as they are."""
+    """Seasons: the survey saw bare trees and bushes, the robot sees leaves. Conifers do not change."""
 
     bare: float = 0.88  # probability that a pulse passes one surface of a bare crown
 
@@ -147,7 +147,7 @@ def aged(scene: Scene, change: Years, rng: np.random.Generator) -> tuple[Scene, 
         plot = scene.footprints[house]
         drawn = plots[int(rng.integers(len(plots)))].draw(rng, plot.w, plot.d)
         now[scene.houses[house]] = placed(drawn, plot.x, plot.y, plot.ground, plot.yaw)
-    # trees of the survey were smaller, and every other vehicle stood then or stands now: none stays for years
+    # trees were smaller at the survey, and vehicles alternate between then and now, as none stays for years
     younger = _kept(before.trees, change, rng)
     younger[:, 2:4] *= np.maximum(1.0 - _GROWTH * change.years / younger[:, 2], _SMALLEST)[:, None]
     old = replace(before, built=tuple(mapped), trees=younger, cars=before.cars[0::2])
@@ -157,7 +157,7 @@ def aged(scene: Scene, change: Years, rng: np.random.Generator) -> tuple[Scene, 
 
 
 def drawn_parts(scene: Scene) -> tuple[Parts, Parts]:
-    """Return the parts of a scene when the map was made and now."""
+    """Return the parts of a scene at the survey and now."""
     assert scene.parts is not None, "the scene was not drawn by build_scene"
     return scene.parts
 
@@ -167,7 +167,7 @@ def _kept(trees: Floats, change: Years, rng: np.random.Generator) -> Floats:
 
 
 _SEEN = 70.0  # metres from the robot within which traffic is drawn
-_CLEAR = 3.2  # metres: a vehicle that would come nearer to the robot waits elsewhere
+_CLEAR = 3.2  # metres: a vehicle that would come nearer to the robot is left out
 _DRIVING, _WALKING = (4.0, 12.0), (0.8, 1.7)  # metres per second
 _FOOTWAY = 0.9  # metres beside the carriageway
 
@@ -176,8 +176,8 @@ _FOOTWAY = 0.9  # metres beside the carriageway
 class Traffic:
     """Moving people and vehicles, none of which is in the map."""
 
-    vehicles: float = 2.0  # on 100 metres of street
-    people: float = 4.0  # on 100 metres of street
+    vehicles: float = 2.0  # per 100 metres of street
+    people: float = 4.0  # per 100 metres of street
     companions: int = 2  # people who walk with the robot, within a few metres
 
     def __post_init__(self) -> None:
@@ -194,14 +194,14 @@ def person() -> Mesh:
 
 @dataclass(frozen=True)
 class _Mover:
-    """A person or vehicle that goes along a street, over and over."""
+    """A person or vehicle that moves along a street again and again."""
 
     mesh: Mesh
     line: Floats  # (K, 2) metres, points a metre apart
-    start: float  # metres along it
-    speed: float  # metres per second; negative against its direction
+    start: float  # metres along the line
+    speed: float  # metres per second; negative against the line's direction
     left: float  # metres to the left of the line
-    clear: float  # metres from the robot that it keeps
+    clear: float  # least distance to the robot, metres
 
     def at(self, seconds: float) -> Floats:
         """Return x, y and yaw."""
@@ -247,7 +247,7 @@ class Movers:
         yaw = yaw_of(T_scene_body)
         c, s = np.cos(yaw), np.sin(yaw)
         for (ahead, left), phase in zip(self._companions.tolist(), self._pace.tolist(), strict=True):
-            ahead += 0.3 * np.sin(0.7 * seconds + phase)  # people keep no even distance
+            ahead += 0.3 * np.sin(0.7 * seconds + phase)  # people do not keep an even distance
             x, y = here[0] + c * ahead - s * left, here[1] + s * ahead + c * left
             parts.append(placed(person(), x, y, self._site.height(x, y), yaw))
         return join(parts)
