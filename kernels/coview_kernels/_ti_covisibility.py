@@ -1,5 +1,5 @@
 # mypy: ignore-errors
-"""Taichi source of covisibility.py: chunks of grids in parallel, the sectors of a grid one after the other."""
+"""Taichi source of covisibility.py: chunks of grids in parallel, the sectors of a grid in sequence."""
 
 from coview_kernels import launch, runtime
 
@@ -18,9 +18,9 @@ def describe_grid(
 ):  # fmt: skip
     """Write the context of the grid that begins at ``at``.
 
-    Slopes are h / (i + 1) with i from 0; they are compared by products that are exact, see reference/. Bins that are
-    vertically visible only have their greatest height, or 0 by the ``paper``. By the paper bins that are visible both
-    ways have their ``mean`` height, and bins on the line of sight itself are visible, too.
+    Slopes are h / (i + 1) with i from 0, and are compared by exact products, see reference/. Bins that are only
+    vertically visible get their greatest height, or 0 by the ``paper``. By the paper, bins that are visible both ways
+    get their ``mean`` height, and bins on the line of sight are visible too.
     """
     size = rings * sectors
     points = ti.cast(0, ti.i64)

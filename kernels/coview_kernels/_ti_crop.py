@@ -1,5 +1,5 @@
 # mypy: ignore-errors
-"""Taichi source of crop.py: the points around a place, measured in one pass and sorted by cell in another."""
+"""Taichi source of crop.py: one pass measures the points around a place, another sorts them by cell."""
 
 from coview_kernels import runtime
 from coview_kernels._ti_nearest import cell_of
@@ -13,20 +13,20 @@ Integers = ti.types.ndarray(i32, 1)
 Bytes = ti.types.ndarray(ti.i8, 1)
 
 FINITE = 3.4028235e38
-# settings: centre (2) and squared radius; of sort also the grid's frame (8)
+# settings: centre (2) and squared radius; for sort also the grid's frame (8)
 RADIUS, FRAME = 2, 3
 
 
 @ti.func
 def inside(settings: ti.template(), x: f32, y: f32, z: f32) -> i32:
-    """Tell whether a point lies within the radius; a NaN does not."""
+    """Return whether a point lies within the radius; false for NaN."""
     dx, dy = ti.cast(x, f64) - settings[0], ti.cast(y, f64) - settings[1]
     return ti.cast(dx * dx + dy * dy < settings[RADIUS], i32) & ti.cast(ti.abs(z) <= FINITE, i32)
 
 
 @runtime.kernel
 def measure(points: Floats, spans: Integers, settings: Doubles, bounds: Floats, count: Integers):
-    """Lowest (3) and highest (3) coordinates of the points inside, and their number."""
+    """Write lowest (3) and highest (3) coordinates of the points inside, and their number."""
     ti.loop_config(serialize=True)
     for _ in range(1):
         around = ti.Vector([settings[k] for k in ti.static(range(3))])
@@ -50,9 +50,9 @@ def sort(
     points: Floats, normals: Bytes, spans: Integers, settings: Doubles,
     cell: Integers, starts: Integers, rows: Integers, planes: Floats,
 ):  # fmt: skip
-    """Sort the points inside by cell, by counting; see crop.py for what is written. ``starts`` comes as zeros.
+    """Sort the points inside by cell with a counting sort; crop.py describes the output.
 
-    ``cell`` has room for a number for every point of the spans.
+    ``starts`` is zeros at first; ``cell`` has room for every point of the spans.
     """
     ti.loop_config(serialize=True)
     for _ in range(1):
@@ -76,7 +76,7 @@ def sort(
         for k in range(starts.shape[0]):
             end += starts[k]
             starts[k] = end
-        # backwards, so that points of a cell keep their order; leaves each start where its cell begins
+        # backwards, so that points of a cell keep their order; each start ends at the beginning of its cell
         for r in range(spans.shape[0] // 2):
             b = spans.shape[0] - 2 - 2 * r
             for m in range(spans[b + 1] - spans[b]):

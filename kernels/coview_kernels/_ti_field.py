@@ -1,10 +1,10 @@
 # mypy: ignore-errors
-"""Taichi source of field.py: a hypothesis after another on each thread, all of its levels in one go.
+"""Taichi source of field.py: each thread takes one hypothesis after another through all levels.
 
-The coarse level counts the hits of a point at all 49 shifts at once: they are neighbouring bits of the raster, seven
+The coarse level counts the hits of a point at all 49 shifts at once. They are neighbouring bits of the raster, seven
 from each of seven rows, and are added to 49 numbers whose digits lie side by side in words.
 
-Points are (3, N), one coordinate after another: then LLVM looks up several at a time.
+Points are (3, N), one coordinate after another, so that LLVM looks up several at a time.
 """
 
 from coview_kernels import runtime
@@ -31,34 +31,34 @@ WHOLES = ti.types.ndarray(ti.i32, 1)
 PLANES = ti.types.ndarray(ti.u16, 1)
 BITS = ti.types.ndarray(ti.i64, 1)
 
-WINDOW = 2 * REACH + 1  # coarse shifts a side
-# bits are counted from the array's beginning, or on large maps from its middle: by ``first``, 0 or -2^31, to which
-# indices are added in 32 bits, going round
+WINDOW = 2 * REACH + 1  # coarse shifts along each axis
+# bits are indexed from the array's beginning, or on large maps from its middle: ``first`` is 0 or -2^31, and indices
+# are added to it in 32 bits with wrap-around
 DIGITS = 7  # of a number of hits: 127 points at most
 CENTIMETRE = 0.01
 
 
 @ti.func
 def clamped(x, tiles) -> ti.i32:
-    """Return the row or column of a coordinate, the first or last where it lies beyond."""
+    """Return the row or column of a coordinate, clamped to the first or last."""
     return ti.min(ti.max(ti.cast(ti.floor(2.0 * x), ti.i32), 0), 32 * tiles - 1)
 
 
 @ti.func
 def place(table: ti.template(), across, i, j) -> ti.i32:
-    """Return the place in the layers of the cell of row i and column j, in the empty tile where there is none."""
+    """Return the index in the layers of the cell in row i and column j, in the empty tile if it is not stored."""
     return (table[(i >> 5) * across + (j >> 5)] << 10) + ((i & 31) << 5) + (j & 31)
 
 
 @ti.func
 def cell_at(table: ti.template(), down, across, x, y) -> ti.i32:
-    """Return the place in the layers of the cell that holds (x, y)."""
+    """Return the index in the layers of the cell that holds (x, y)."""
     return place(table, across, clamped(y, down), clamped(x, across))
 
 
 @ti.func
 def ground_of(packed) -> ti.i32:
-    """Return the ground's height, in the lower half of a word of the surface, with its sign."""
+    """Return the ground height, the signed lower half of a word of the surface."""
     return (packed << 16) >> 16
 
 
@@ -70,12 +70,12 @@ def bit(word, z):
 
 @ti.func
 def coarse_best(planes: ti.template(), high, blocks, structure: ti.template(), x, y, z, yaw):
-    """Return the shift and the turn, in steps, at which most points are near structure; small ones first."""
+    """Return the shift and the turn, in steps, at which most points are near structure; small ones win ties."""
     best, at, turn = -1, 0, 0
     for a in range(TURNS):
         angle = yaw + TURN * (a - TURNS // 2)
         c, s = ti.cos(angle), ti.sin(angle)
-        # digits of 49 numbers that are counted in one go: bit 7 i + j of the d-th word is digit d of shift (i, j)
+        # digits of 49 numbers counted at once: bit 7 i + j of the d-th word is digit d of shift (i, j)
         digits = ti.Vector.zero(ti.i64, DIGITS)
         for p in range(structure.shape[1]):
             u, v = structure[0, p], structure[1, p]
@@ -96,7 +96,7 @@ def coarse_best(planes: ti.template(), high, blocks, structure: ti.template(), x
             hits = 0
             for d in ti.static(range(DIGITS)):
                 hits += ti.cast((digits[d] >> k) & 1, ti.i32) << d
-            # of equal ones the nearest: a sixteenth of a point for each step
+            # the nearest wins a tie: each step costs a sixteenth of a point
             off = ti.abs(k // WINDOW - REACH) + ti.abs(k % WINDOW - REACH) + ti.abs(a - TURNS // 2)
             value = 16 * hits - off
             if value > best:
@@ -106,7 +106,7 @@ def coarse_best(planes: ti.template(), high, blocks, structure: ti.template(), x
 
 @ti.func
 def _nine_cells(down, across, structure: ti.template(), p, x, y, z, yaw, step):
-    """Return a point's level, and its three rows and columns at a pose and the eight ``step`` metres away."""
+    """Return a point's level, and its three rows and columns at a pose and at shifts of ``step`` metres."""
     c, s = ti.cos(yaw), ti.sin(yaw)
     u, v = structure[0, p], structure[1, p]
     level = ti.cast(ti.floor(2.0 * (z + structure[2, p])), ti.i64) & 63
@@ -123,7 +123,7 @@ def fine_hits(
     table: ti.template(), down, across, bits: ti.template(), first, structure: ti.template(), x, y, z, yaw, step,
     hits: ti.template(),
 ):  # fmt: skip
-    """Count at a pose, and at the eight ``step`` metres away, points on structure and points near it."""
+    """Count points on structure and points near it, at a pose and at its eight neighbours ``step`` metres away."""
     for p in range(structure.shape[1]):
         level, rows, columns = _nine_cells(down, across, structure, p, x, y, z, yaw, step)
         for i in ti.static(range(3)):
@@ -137,10 +137,10 @@ def closer_hits(
     table: ti.template(), down, across, bits: ti.template(), first, structure: ti.template(), x, y, z, yaw, step,
     hits: ti.template(),
 ):  # fmt: skip
-    """Count like :func:`fine_hits` for steps of half a cell at most: its nine poses share four cells."""
+    """Count like :func:`fine_hits` for steps of at most half a cell, when the nine poses share four cells."""
     for p in range(structure.shape[1]):
         level, rows, columns = _nine_cells(down, across, structure, p, x, y, z, yaw, step)
-        # of the first and the last row and column
+        # in the first and the last row and column
         cells = ti.Vector.zero(ti.i32, 4)
         for k in ti.static(range(4)):
             at = 2 * place(table, across, rows[2 * (k // 2)], columns[2 * (k % 2)]) + first
@@ -163,7 +163,7 @@ def closer_hits(
 def hits_at(
     table: ti.template(), down, across, bits: ti.template(), first, structure: ti.template(), x, y, z, yaw
 ) -> ti.i32:  # fmt: skip
-    """Count at a pose points on structure and points near it."""
+    """Count points on structure and points near it at a pose."""
     c, s = ti.cos(yaw), ti.sin(yaw)
     hits = 0
     for p in range(structure.shape[1]):
@@ -179,7 +179,7 @@ def rise(
     table: ti.template(), down, across, base: ti.template(), surface: ti.template(), low: ti.template(),
     x, y, z, yaw, reach,
 ) -> ti.f32:  # fmt: skip
-    """Return by how much the scan has to rise to the map's ground, from points within ``reach`` of it."""
+    """Return the metres that the scan has to rise to the map's ground, from points within ``reach`` of it."""
     c, s = ti.cos(yaw), ti.sin(yaw)
     total, number = ti.cast(0.0, ti.f32), 0
     for p in range(low.shape[1]):
@@ -200,7 +200,7 @@ def score(
     levels: ti.i32, coarse: ti.i32,
     poses: DOUBLES, counts: WHOLES, chunks: ti.i32,
 ):  # fmt: skip
-    """Move and score poses; the coarse level, the fine ones and the height take ``few``, ``some`` and ``lows``."""
+    """Move and score poses; coarse level, fine levels and height use the points ``few``, ``some`` and ``lows``."""
     for task in range(chunks * SPAN):
         if task % SPAN == 0:
             down = table.shape[0] // across
@@ -219,11 +219,11 @@ def score(
                             y += ti.cast(at // WINDOW - REACH, ti.f32)
                             yaw += TURN * (turn - TURNS // 2)
                             step, angle = ti.cast(0.5, ti.f32), ti.cast(0.5 * TURN, ti.f32)
-                        for k in range(2):  # a loop: each call in the source is compiled by itself
+                        for k in range(2):  # a loop, because each call in the source is compiled separately
                             reach = ti.select(k == 0, ti.cast(2.0, ti.f32), ti.cast(0.5, ti.f32))
                             z += rise(table, down, across, base, surface, lows, x, y, z, yaw, reach)
                     for _ in range(levels):
-                        # the shift first, then the heading there: a third of what all pairs of them would cost
+                        # the shift first, then the heading: a third of the cost of all pairs
                         hits = ti.Vector.zero(ti.i32, 9)
                         if step > 0.25:
                             fine_hits(table, down, across, bits, first, some, x, y, z, yaw, step, hits)

@@ -1,10 +1,10 @@
 # mypy: ignore-errors
-"""Taichi source of icp.py: an iteration per launch, whose searches are spread over the threads.
+"""Taichi source of icp.py: one iteration per launch, with its searches spread over the threads.
 
-Partners are searched for only when they may have changed, and kept beside their point: where few are, an iteration
-reads memory in order. Waking the threads costs as much as an iteration over some hundred points; what follows the
-search is too little to be worth that again, so one thread does it. With a single worker nothing is spread: even one
-thread of the pool would have to be woken.
+A partner is searched only when it may have changed, and is stored beside its point, so that an iteration with few
+searches reads memory in order. Waking the threads costs as much as an iteration over some hundred points. One thread
+therefore does the rest after the search, and with a single worker nothing is spread, as even one thread of the pool
+would have to be woken.
 """
 
 from coview_kernels import runtime
@@ -19,25 +19,26 @@ WHOLES = ti.types.ndarray(ti.i32, 1)
 
 SERIAL = runtime.workers() == 1
 SLACK = 1e-9  # metres: more than rounding adds to a bound
-MAX_SHARE = 5.0  # weight of a point of the rarer kind
-SCATTER = 2.0  # times the width of the weights, how far points lie about one another where they form no surface
-MARGIN = 0.15  # metres that a search looks further than it must, so that it serves later poses; 0.05-0.3 are as fast
-BLOCK = 6  # 2^6 points go to one thread, the next to another: those that must search far come in clusters
+MAX_SHARE = 5.0  # greatest weight of a point of the rarer kind
+SCATTER = 2.0  # distance between points that form no surface, in widths of the weights
+MARGIN = 0.15  # metres by which a search exceeds its limit, to serve later poses; 0.05 to 0.3 are as fast
+BLOCK = 6  # 2^6 points per thread in turn, as points with long searches come in clusters
 
-# memory of a point: where it was searched for (3), and how far all map points but its partner were then at least
+# memory of a point: its position at the last search (3), and a lower bound of its distance to all map points except
+# its partner there
 SAFE, PLACE = 3, 4
-# partner of a point: position (3) and normal (3); far away where there is none
+# partner of a point: position (3) and normal (3); far away if there is none
 PARTNER = 6
-# bins of squared distances, 64 to an octave from 2^-20 square metres up: a row for either kind of point of each chunk,
-# and before them the bin of every point
+# bins of squared distances, 64 per octave from 2^-20 square metres up: a row for each kind of point in each chunk,
+# preceded by the bin of every point
 FIRST_BIN, BINS = 107 << 6, 2048
 # settings; see icp.py
 ITERATIONS, SCALES, MIN_PAIRS, PRIOR = 8, 9, 10, 11
 PIVOT, MEAN, BELIEF, FIRST = 12, 15, 27, 63
-# and of each scale radius, width of the weights, the shift and turn that end it, how many of the points take part, and
-# the share of the pairs that is kept
+# and for each scale radius, width of the weights, the shift and turn that end it, number of points used, and share of
+# the pairs that is kept
 RADIUS, WIDTH, SHIFT, TURN, POINTS, KEEP, EACH = 0, 1, 2, 3, 4, 5, 6
-# state: pose by rows (12), then these, the information (36), the sums of a step (30), and six values to work with
+# state: pose by rows (12), then these, the information (36), the sums of a step (30), and six working values
 SCALE, ROUND, TOTAL, STATUS, CONVERGED, INFORMATION, SUMS, OFF = 12, 13, 14, 15, 16, 17, 53, 83
 RUNNING, DONE, LOST = 0, 1, 2
 
@@ -58,11 +59,11 @@ def pair(
     frame, starts: ti.template(), rows: ti.template(), normals: ti.template(), at, i, radius,
     memory: ti.template(), partners: ti.template(),
 ) -> ti.f64:  # fmt: skip
-    """Bring the partner of point ``i``, now ``at``, up to date; return the square of its distance."""
+    """Update the partner of point ``i``, now ``at``; return its squared distance."""
     drift = (at - ti.Vector([memory[PLACE * i], memory[PLACE * i + 1], memory[PLACE * i + 2]])).norm()
     safe = ti.max(memory[PLACE * i + SAFE] - drift - SLACK, 0.0)
     near = (at - floats(partners, PARTNER * i)).norm_sqr()
-    # by the triangle inequality no other point is nearer than safe: the partner stays, or there still is none
+    # by the triangle inequality no other point is nearer than safe: the partner stays, or there is still none
     if safe * safe < ti.min(near, radius * radius):
         # the old partner is a bound already
         limit = ti.min(ti.sqrt(near), radius) + MARGIN
@@ -84,13 +85,13 @@ def pair(
 
 @ti.func
 def trim(keep, chunks, n, first, bins: ti.template()):
-    """For either kind of point: the farthest bin that is kept, and the weight of each pair that is."""
+    """Return, for each kind of point, the farthest bin kept and the weight of each pair kept."""
     last = ti.Vector([-1, -1])
     share = ti.Vector.zero(ti.f64, 2)
     for c in range(1, chunks):
         for b in range(first, first + 2 * BINS):
             bins[b] = bins[b] + bins[b + 2 * c * BINS]
-    for kind in range(2):  # not unrolled: that takes a tenth of a second to compile in every process
+    for kind in range(2):  # not unrolled, which would take a tenth of a second to compile in every process
         mine = first + kind * BINS
         found = 0
         for b in range(mine, mine + BINS):
@@ -104,7 +105,7 @@ def trim(keep, chunks, n, first, bins: ti.template()):
 
 
 def _place(row, column):
-    """Return where a number of the triangle, whose last column is b, stands among the sums."""
+    """Return the index in the sums of an element of the triangle, whose last column is b."""
     return 7 * row - row * (row - 1) // 2 + column - row
 
 
@@ -113,9 +114,9 @@ def add_up(
     T, about, width, n, last, share, source: ti.template(), kinds: ti.template(),
     partners: ti.template(), bins: ti.template(), state: ti.template(),
 ):  # fmt: skip
-    """Leave in the state: triangle of H by rows (21), b (6), sums of w r^2 and of w, pairs.
+    """Write to the state: triangle of H by rows (21), b (6), sums of w r^2 and of w, pairs.
 
-    A pair whose partner lies on a surface tells of the direction of its normal, one in scatter of all three axes.
+    A pair whose partner lies on a surface constrains the direction of its normal; a pair in scatter, all three axes.
     """
     acc, M = ti.Vector.zero(ti.f64, 30), ti.Matrix.zero(ti.f64, 3, 3)
     for i in range(n):
@@ -132,7 +133,7 @@ def add_up(
             w = own * planarity / (1.0 + ratio * ratio)
             length = gap.norm_sqr()
             v = own * (1.0 - planarity) / (SCATTER * SCATTER + length / (width * width))
-            # W = w n n^T + v I weighs the gap; a turn moves the point by its cross product with the arm
+            # W = w n n^T + v I weighs the gap; a rotation moves the point by its cross product with the arm
             arm, pull = at - about, w * r * normal + v * gap
             torque = arm.cross(pull)
             for column in ti.static(range(3)):
@@ -159,7 +160,7 @@ def add_up(
 
 @ti.func
 def solve(pivot, about, settings: ti.template(), state: ti.template(), system: ti.template()):
-    """Fuse the sums with the prior into ``state``'s information; leave the increment in the system's last column."""
+    """Fuse the sums with the prior into ``state``'s information; write the increment to the system's last column."""
     variance = state[SUMS + 27] / state[SUMS + 28] + 1e-6
     k = SUMS
     for a in range(6):
@@ -192,8 +193,8 @@ def solve(pivot, about, settings: ti.template(), state: ti.template(), system: t
 
 @ti.func
 def eliminate(system: ti.template()):
-    """Gauss-Jordan with pivots, as the matrix may be all but singular."""
-    n = system.shape[0]  # which the compiler does not know: it would unroll all the loops
+    """Gauss-Jordan elimination with pivots, as the matrix may be almost singular."""
+    n = system.shape[0]  # unknown to the compiler, which would otherwise unroll all loops
     for c in range(n):
         top = c
         for a in range(c + 1, n):
@@ -214,7 +215,7 @@ def eliminate(system: ti.template()):
 
 @ti.func
 def advance(about, settings: ti.template(), state: ti.template(), system: ti.template()):
-    """Apply the increment to the pose, about ``about``, and see what follows."""
+    """Apply the increment to the pose, about ``about``, and set scale and status."""
     turn = ti.Vector([system[d, 6] for d in ti.static(range(3))])
     shift = ti.Vector([system[d, 6] for d in ti.static(range(3, 6))])
     angle = turn.norm()
@@ -250,9 +251,9 @@ def align(
     settings: DOUBLES, starts: WHOLES, rows: WHOLES, normals: FLOATS, source: FLOATS, kinds: WHOLES, memory: DOUBLES,
     partners: FLOATS, bins: WHOLES, system: ti.types.ndarray(ti.f64, 2), state: DOUBLES, chunks: ti.i32,
 ):  # fmt: skip
-    """Take a step from the state's pose; the status says whether another one should follow.
+    """Take one step from the state's pose; the status says whether another step should follow.
 
-    Of the points the first ones take part in the coarse scales; ``kinds`` is 0 or 1.
+    Coarse scales use the first points only; ``kinds`` is 0 or 1.
     """
     ti.loop_config(serialize=SERIAL)
     for q in range(chunks * SPAN):

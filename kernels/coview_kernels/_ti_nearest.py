@@ -1,21 +1,21 @@
 # mypy: ignore-errors
-"""Taichi source of nearest.py: every query walks rings of columns around its own until none can hold a nearer point."""
+"""Taichi source of nearest.py: a query walks rings of columns around its own until none can hold a nearer point."""
 
 from coview_kernels import runtime
 
 ti = runtime.library()
 
-WHOLES = ti.types.ndarray(ti.i32, 1)  # rows are flat, four numbers each: an index costs no look at the shape
+WHOLES = ti.types.ndarray(ti.i32, 1)  # rows are flat, four numbers each, so that an index does not read the shape
 DOUBLES = ti.types.ndarray(ti.f64, 1)
 POINTS, MATRIX = ti.types.ndarray(ti.f32, 2), ti.types.ndarray(ti.f64, 2)
 
-SLACK = 1e-9  # metres, and of the distance: more than rounding moves a face between two cells
-FAR = 1e18  # metres, stands for no face
+SLACK = 1e-9  # metres, and share of the distance: more than rounding moves a face between two cells
+FAR = 1e18  # metres: no face
 
 
 @ti.func
 def short_of(d) -> ti.f64:
-    """Shorten a distance to a face of a cell by what rounding may have added to it."""
+    """Shorten a distance to a face of a cell by the possible rounding error."""
     return ti.max(d - SLACK - SLACK * ti.abs(d), ti.cast(0.0, ti.f64))
 
 
@@ -38,10 +38,10 @@ def cell_of(cells, count) -> ti.i32:
 
 @ti.func
 def walk(frame: ti.template(), starts: ti.template(), rows: ti.template(), x, y, z, limit, margin):
-    """Find the nearest point of those nearer than the square root of ``limit``.
+    """Find the nearest point within the square root of ``limit``.
 
-    Returns the square of its distance, its row (-1 if there is none), and a square that the distance of every other
-    point reaches: that of the second nearest, the limit, or the nearest's distance and ``margin`` together.
+    Returns its squared distance, its row (-1 if there is none), and a lower bound of the squared distance of every
+    other point: of the second nearest, the limit, or of the nearest's distance plus ``margin``.
     """
     size, per_metre = frame[3], frame[4]
     nx, ny, nz = ti.cast(frame[5], ti.i32), ti.cast(frame[6], ti.i32), ti.cast(frame[7], ti.i32)
@@ -49,10 +49,10 @@ def walk(frame: ti.template(), starts: ti.template(), rows: ti.template(), x, y,
     beyond = limit
     found = -1
     ring = 0
-    # by its bits: a host program may have told the compiler that there are no NaNs
+    # by its bits, as a host program may have told the compiler that there are no NaNs
     if ((ti.bit_cast(x + y + z, ti.i64) >> 52) & 0x7FF) == 0x7FF:
         ring = -1
-    # offsets from the corner only find cells; distances must round as the twin's
+    # offsets from the corner are only for cells; distances must round like the twin's
     u = x - frame[0]
     v = y - frame[1]
     w = z - frame[2]
@@ -78,7 +78,7 @@ def walk(frame: ti.template(), starts: ti.template(), rows: ti.template(), x, y,
                         ez = z - ti.cast(ti.bit_cast(rows[4 * p + 2], ti.f32), ti.f64)
                         d2 = ex * ex + ey * ey + ez * ez
                         if d2 < best:
-                            # without a margin the nearest bounds the search, to the bit
+                            # without a margin the nearest bounds the search exactly
                             if margin > 0:
                                 far = ti.sqrt(d2) + margin
                                 beyond = ti.min(beyond, ti.min(best, far * far))
@@ -90,7 +90,7 @@ def walk(frame: ti.template(), starts: ti.template(), rows: ti.template(), x, y,
                             beyond = d2
                 # the ring has every column of its first and last row, but only the ends of the others
                 j += 1 if ti.abs(i - ix) == ring else 2 * ring
-        # the nearest face of the columns outside the ring, on the sides where there are any
+        # the nearest face of the columns outside the ring, on sides that have any
         reach = ti.cast(FAR, ti.f64)
         if ix > ring:
             reach = ti.min(reach, u - (ix - ring) * size)
@@ -109,10 +109,10 @@ def walk(frame: ti.template(), starts: ti.template(), rows: ti.template(), x, y,
 
 @runtime.kernel
 def nearest(frame: DOUBLES, starts: WHOLES, rows: WHOLES, queries: POINTS, T: MATRIX, radius: ti.f64, answer: MATRIX):
-    """Write distances and indices, the rows of ``answer``, where there is a point.
+    """Write distances and indices, the rows of ``answer``, for queries with a point within ``radius``.
 
-    ``frame``: the corner (3), edge, reciprocal edge and numbers (3) of the cells. Columns on the border stand for
-    what lies beyond them. One thread does it: mostly some hundred points are asked for, less than waking another costs.
+    ``frame``: the corner (3), edge, reciprocal edge and numbers (3) of the cells. Columns on the border extend to
+    infinity. On one thread: most calls have some hundred queries, which take less time than waking another thread.
     """
     ti.loop_config(serialize=True)
     for n in range(queries.shape[0]):
@@ -131,7 +131,7 @@ def nearest(frame: DOUBLES, starts: WHOLES, rows: WHOLES, queries: POINTS, T: MA
 
 @runtime.kernel
 def sort(points: POINTS, frame: DOUBLES, cell: WHOLES, starts: WHOLES, rows: WHOLES):
-    """Sort the points by cell into ``rows``, by counting; ``starts`` comes as zeros, one more than cells."""
+    """Sort the points by cell into ``rows`` with a counting sort; ``starts`` is zeros at first, one more than cells."""
     for n in range(points.shape[0]):
         nx, ny, nz = ti.cast(frame[5], ti.i32), ti.cast(frame[6], ti.i32), ti.cast(frame[7], ti.i32)
         i = cell_of((ti.cast(points[n, 0], ti.f64) - frame[0]) * frame[4], nx)
@@ -147,7 +147,7 @@ def sort(points: POINTS, frame: DOUBLES, cell: WHOLES, starts: WHOLES, rows: WHO
         for c in range(starts.shape[0]):
             end += starts[c]
             starts[c] = end
-        # backwards, so that points of a cell keep their order; leaves each start where its cell begins
+        # backwards, so that points of a cell keep their order; each start ends at the beginning of its cell
         for m in range(points.shape[0]):
             n = points.shape[0] - 1 - m
             place = starts[cell[n]] - 1

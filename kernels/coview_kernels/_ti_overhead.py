@@ -1,5 +1,5 @@
 # mypy: ignore-errors
-"""Taichi source of overhead.py: scatters, one point after the other on one thread; a pass takes 3 to 8 ns a point."""
+"""Taichi source of overhead.py: scatters point by point on one thread; a pass takes 3 to 8 ns per point."""
 
 from coview_kernels import runtime
 
@@ -37,7 +37,7 @@ def lowest(points: FLOATS, frame: FLOATS, rows: i32, columns: i32, out: FLOATS):
 def near(
     points: FLOATS, frame: FLOATS, rows: i32, columns: i32, level: FLOATS, band: f32, count: LONGS, total: DOUBLES
 ):
-    """Count the points within ``band`` of a cell's level, and add up how far they are above it."""
+    """Count the points within ``band`` of a cell's level, and sum their heights above it."""
     ti.loop_config(serialize=True)
     for k in range(points.shape[0] // 3):
         _, _, cell = cell_of(points, k, frame, rows, columns)
@@ -53,7 +53,7 @@ def columns_of(
     points: FLOATS, frame: FLOATS, rows: i32, columns: i32, ground: FLOATS, wide: i32, occupied: BYTES, top: FLOATS,
     seen: BYTES,
 ):  # fmt: skip
-    """Fill columns; ``frame``: and ground cells per metre, levels per metre, lower and upper bound, bound of ground."""
+    """Fill columns; ``frame`` also has ground cells per metre, levels per metre, lower, upper and ground bounds."""
     ti.loop_config(serialize=True)
     high, top_level = ground.shape[0] // wide, occupied.shape[0] // (rows * columns) - 1
     for k in range(points.shape[0] // 3):

@@ -1,9 +1,9 @@
 # mypy: ignore-errors
-"""Taichi source of polar.py. Every chunk of points has bins of its own: atomics on shared ones are slower.
+"""Taichi source of polar.py. Every chunk of points has its own bins, as atomics on shared bins are slower.
 
-A store to an argument is never vectorised (it might alias the others), a store to a local vector is. So points go by
-blocks: their bins are computed to float32 accuracy, eight points at a time, into a local vector; then they are added
-to the bins one by one; and the few near an edge are compared with it exactly.
+A store to an argument is never vectorised (it might alias the others), a store to a local vector is. Points are
+therefore processed in blocks: their bins are computed to float32 accuracy, eight points at a time, into a local vector;
+then the points are added to the bins one by one; the few points near an edge are compared with it exactly.
 """
 
 from coview_kernels import launch, runtime
@@ -20,13 +20,13 @@ SERIAL = runtime.workers() == 1  # waking the pool costs 50 us even for one thre
 BLOCK = 64
 FINITE = 3.4028235e38
 LOWEST = -FINITE
-# of the bins behind the grid's
+# offsets of the bins behind the grid's
 OUTSIDE, BROKEN, NEAR, BEHIND = 0, 1, 2, 3
 
 
 @ti.func
 def polar(dx: f32, dy: f32, rings: f32, sectors: f32, per_metre: f32):
-    """Range in rings, at most ``rings + 1.5``, to 1e-6 of ``rings``; angle in sectors, to 3e-6 of ``sectors``."""
+    """Return range in rings, at most ``rings + 1.5``, to 1e-6 of all; angle in sectors, to 3e-6 of all."""
     far = ti.sqrt(dx * dx + dy * dy) * per_metre
     far = ti.select(far < rings + 1.5, far, rings + 1.5)
     ax, ay = ti.abs(dx), ti.abs(dy)
@@ -44,7 +44,7 @@ def polar(dx: f32, dy: f32, rings: f32, sectors: f32, per_metre: f32):
 
 @ti.func
 def exact_bin(dx: f32, dy: f32, rings: i32, sectors: i32, per_metre: f32, edges: ti.template()) -> i32:
-    """Bin of an offset by comparing it with the edges as in reference/polar.py; R S at and beyond ``r_max``.
+    """Return the bin of an offset, compared with the edges as in reference/polar.py; R S at and beyond ``r_max``.
 
     ``edges``: the R + 1 squared ring edges, then the S + 1 rays as x, y.
     """
@@ -52,7 +52,7 @@ def exact_bin(dx: f32, dy: f32, rings: i32, sectors: i32, per_metre: f32, edges:
     r2 = x * x + y * y
     b = rings * sectors
     if r2 < edges[rings]:
-        # both guesses are off by one at most
+        # both guesses are off by at most one
         far, angle = polar(dx, dy, ti.cast(rings, f32), ti.cast(sectors, f32), per_metre)
         ring = ti.min(ti.cast(far, i32), rings - 1)
         if r2 < edges[ring]:
@@ -80,7 +80,7 @@ def add(
     cx, cy, cz = params[0], params[1], params[2]
     per_metre = ti.cast(params[3], f32)
     all_rings, all_sectors = ti.cast(rings, f32), ti.cast(sectors, f32)
-    # as far as this from the middle of a ring or sector there is no doubt
+    # within this distance from the middle of a ring or sector the bin is certain
     sure_ring, sure_sector = 0.5 - 1e-6 * (all_rings + 2.0), 0.5 - 4e-6 * all_sectors
     at, height = ti.Vector.zero(i32, BLOCK), ti.Vector.zero(f32, BLOCK)
     near = 0
@@ -130,7 +130,7 @@ def bins(
     """Add ``rows`` points to the bins of their chunks: greatest height, number, and sum of the heights.
 
     A chunk has R S bins and three more: points beyond ``r_max``, points that are not finite, points near an edge.
-    ``params``: centre x, y, z, rings per metre. All arrays are flat: an index into more axes costs a read of the
+    ``params``: centre x, y, z, rings per metre. All arrays are flat, as an index into more axes costs a read of the
     shape and a product each time.
     """
     ti.loop_config(serialize=SERIAL)
@@ -151,9 +151,9 @@ def station_bins(
     stations: i32, chunks: i32, size: i32, top: Floats, points: Integers, base: Integers, ground: Floats,
     starts: Integers, offsets: Integers, highest: Floats, count: Integers,
 ):  # fmt: skip
-    """Bin b of a station gathers the cells ``base + offsets[starts[b]:starts[b + 1]]`` of the padded raster.
+    """Sum into bin b of a station the cells ``base + offsets[starts[b]:starts[b + 1]]`` of the padded raster.
 
-    The cells are sorted by bin, so a bin is summed in registers and stored once.
+    The cells are sorted by bin, so that a bin is summed in registers and stored once.
     """
     for q in range(chunks * SPAN):
         if q % SPAN == 0:
@@ -179,7 +179,7 @@ def station_means(
     stations: i32, chunks: i32, size: i32, total: Doubles, base: Integers, ground: Floats,
     starts: Integers, offsets: Integers, count: Integers, mean: Floats,
 ):  # fmt: skip
-    """Mean heights of the bins that ``station_bins`` counted; ``total``: sum of the heights of each padded cell."""
+    """Write mean heights of the bins that ``station_bins`` counted; ``total``: sum of heights in each padded cell."""
     for q in range(chunks * SPAN):
         if q % SPAN == 0:
             c = q // SPAN

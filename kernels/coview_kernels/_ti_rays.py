@@ -1,5 +1,5 @@
 # mypy: ignore-errors
-"""Taichi source of rays.py: each ray goes down the tree, the nearer child first, and up again by the nodes' numbers."""
+"""Taichi source of rays.py: each ray descends the tree, nearer child first, and ascends by the nodes' numbers."""
 
 from coview_kernels import runtime
 from coview_kernels.reference.rays import EDGE, LEAST, THIN
@@ -10,18 +10,18 @@ FLOATS = ti.types.ndarray(ti.f32, 1)
 WHOLES = ti.types.ndarray(ti.i32, 1)
 
 NOWHERE = 1e30  # metres
-SLACK = 1e-6  # of a distance, and metres: more than rounding in float32 moves a side of a box
+SLACK = 1e-6  # metres, and share of a distance: more than float32 rounding moves a side of a box
 
 
 @ti.func
 def three(numbers: ti.template(), at):
-    """Return the three numbers from ``at`` on."""
+    """Return three numbers from index ``at`` on."""
     return ti.Vector([ti.cast(numbers[at + d], ti.f64) for d in ti.static(range(3))])
 
 
 @ti.func
 def met(corners: ti.template(), at, o, d) -> ti.f64:
-    """Return the distance to the triangle whose corners stand at ``at``, or :data:`NOWHERE`."""
+    """Return the distance to the triangle with corners at index ``at``, or :data:`NOWHERE`."""
     corner = three(corners, at)
     one, other = three(corners, at + 3) - corner, three(corners, at + 6) - corner
     side = d.cross(other)
@@ -38,9 +38,10 @@ def met(corners: ti.template(), at, o, d) -> ti.f64:
 
 @ti.func
 def enters(boxes: ti.template(), at, o, whole, best):
-    """Tell whether a ray enters the box whose sides stand at ``at``, nearer than ``best``; all in float32.
+    """Return whether a ray enters the box with sides at index ``at`` nearer than ``best``; all in float32.
 
-    ``whole`` is one over the ray's direction. Minima and maxima are spelt out: the library's care for NaN costs half.
+    ``whole`` is one over the ray's direction. Minima and maxima are written out, because the library's handling of NaN
+    costs half.
     """
     near, far = ti.cast(0.0, ti.f32), best
     for k in ti.static(range(3)):
@@ -52,7 +53,7 @@ def enters(boxes: ti.template(), at, o, whole, best):
 
 @runtime.kernel
 def cast(boxes: FLOATS, axes: WHOLES, corners: FLOATS, rays: FLOATS, distance: FLOATS, found: WHOLES):
-    """Write the distance to the first triangle of each ray, and its place among the corners (-1: none)."""
+    """Write the distance to the first triangle on each ray, and its place among the corners (-1: none)."""
     for n in range(distance.shape[0]):
         leaves = axes.shape[0]
         size = corners.shape[0] // 9 // leaves

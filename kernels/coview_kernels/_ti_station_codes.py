@@ -2,8 +2,8 @@
 """Taichi source of station_codes.py: correlations of a query with coded stations.
 
 ``best`` keeps 16-bit lanes in local vectors, which LLVM keeps in registers. A store to an argument is never vectorised
-(it might alias the others); a local vector is known to be private. The inner loops therefore compile to vpmulhw and
-vpaddw on 16 lanes: measured 5 times the rate of a reduction.
+(it might alias the others), but a local vector is known to be private. The inner loops therefore compile to vpmulhw and
+vpaddw on 16 lanes, measured at 5 times the rate of a reduction.
 """
 
 from functools import lru_cache
@@ -21,7 +21,7 @@ SHORTS, WHOLES, FLOATS = ti.types.ndarray(i16, 1), ti.types.ndarray(i32, 1), ti.
 
 @ti.func
 def high(a, b):
-    # the upper half of a 16 x 16 bit product, one instruction (vpmulhw)
+    # upper half of a 16 x 16 bit product, one instruction (vpmulhw)
     return ti.cast((ti.cast(a, i32) * ti.cast(b, i32)) >> 16, i16)
 
 
@@ -56,14 +56,14 @@ def _best(serial: bool):
         if ti.static(serial):
             ti.loop_config(serialize=True)
         for m in range(found.shape[0]):
-            # what the upper halves miss on the mean, half a unit each
+            # mean truncation error of the upper halves, half a unit each
             x0 = ti.Vector([ti.cast(LOW, i16)] * LANES)
             y0 = ti.Vector([ti.cast(LOW, i16)] * LANES)
             x1 = ti.Vector([ti.cast(HIGH, i16)] * LANES)
             y1 = ti.Vector([ti.cast(HIGH, i16)] * LANES)
             products(codes, query, m * SIZE, 0, LOW, x0, y0)
             products(codes, query, m * SIZE, LOW, HIGH, x1, y1)
-            # sums over even frequencies, and over odd ones, which change their sign half a turn on
+            # sums over even frequencies, and over odd ones, which change sign after half a turn
             even = ti.Vector([ti.cast(8, i16)] * LANES)
             odd = ti.Vector([ti.cast(8, i16)] * LANES)
             even_sine = ti.Vector([ti.cast(8, i16)] * LANES)
@@ -84,7 +84,7 @@ def _best(serial: bool):
                             xs[4 + u] = x1[8 + h * 4 + u]
                             ys[4 + u] = y1[8 + h * 4 + u]
                     for n in range(LANES):
-                        # adds nothing, but keeps a number that all lanes share from being spread as 32 bits
+                        # adds nothing, but keeps a number that all lanes share from being broadcast as 32 bits
                         zero = turn[n]
                         a = ti.cast(0, i16)
                         b = ti.cast(0, i16)
@@ -101,7 +101,7 @@ def _best(serial: bool):
                         odd[n] += c
                         odd_sine[n] += d
             most = ti.cast(-32768, i16)
-            # a length that the compiler does not know: it unrolls a known one into scalars
+            # the length is unknown to the compiler, which would unroll a known one into scalars
             for n in range(length):
                 p = even_sine[n] + odd_sine[n]
                 q = even_sine[n] - odd_sine[n]

@@ -1,10 +1,10 @@
 # mypy: ignore-errors
 """Taichi source of voxel_filter.py: one pass over the points, with a hash table of cubes of 4 x 4 x 4 voxels.
 
-Points go by blocks. They are moved and their voxels numbered into local vectors, which the compiler does several
-points at a time (a store to an argument might alias and is never vectorised). Then they are looked up one by one: a
-cube has 64 bits, one for each voxel, so that the points of a surface, one beside the other, rarely need the table.
-Blocks are always full: loops of unknown length take half as long again to compile, at every start.
+Points are processed in blocks. They are moved, and their voxels are numbered into local vectors, several points at a
+time (a store to an argument might alias and is never vectorised). Then they are looked up one by one: a cube has 64
+bits, one per voxel, so that neighbouring points of a surface rarely need the table. Blocks are always full, as loops of
+unknown length take half as long again to compile, at every start.
 """
 
 from coview_kernels import runtime
@@ -26,7 +26,7 @@ GOLDEN = -7046029254386353131
 
 @ti.func
 def voxel_of(p: f32, limit: f32, inverse: f64, middle: i32) -> i32:
-    """``floor(p * inverse)`` above ``middle``; of truncation, since that is vectorised. NaN is far away."""
+    """Return ``floor(p * inverse)`` above ``middle``, by truncation, which is vectorised. NaN is far away."""
     p = ti.select(p < limit, p, limit)
     p = ti.select(p > -limit, p, -limit)
     v = ti.cast(p, f64) * inverse
@@ -39,10 +39,10 @@ def number_voxels(
     start: i32, points: ti.template(), settings: ti.template(),
     a: ti.template(), b: ti.template(), c: ti.template(), plane: ti.template(), rest: ti.template(),
 ):  # fmt: skip
-    """Move a block to a, b, c and number their voxels; return how many are not finite and how many out of reach.
+    """Move a block to a, b, c and number the voxels; return how many points are not finite and how many out of reach.
 
-    ``plane`` is the cube's index along x and y, ``rest`` along z, the voxel in the cube (6 bits) and whether the
-    point is in range.
+    ``plane`` has the cube's index along x and y, ``rest`` its index along z, the voxel in the cube (6 bits) and whether
+    the point is in range.
     """
     T = ti.Vector([settings[k] for k in ti.static(range(12))])
     inverse, nearest, farthest = settings[12], settings[13], settings[14]
@@ -82,8 +82,8 @@ def keep_first(
 ):  # fmt: skip
     """Append the first point of each voxel to ``moved``; return its new end, the cubes added, and the last cube.
 
-    ``table`` has a key and 64 bits for each cube. A slot is free unless its key is of this ``call``: nothing is
-    ever cleared. The bits of the last cube, at ``at``, are in ``seen`` until there is another one.
+    ``table`` has a key and 64 bits for each cube. A slot is free unless its key belongs to this ``call``; nothing is
+    ever cleared. The bits of the last cube, at ``at``, are in ``seen`` until another cube follows.
     """
     cubes = 0
     for j in range(BLOCK):
@@ -103,7 +103,7 @@ def keep_first(
             cubes += fresh
             table[2 * at] = k
             seen = ti.select(fresh != 0, i64(0), table[2 * at + 1])
-        # written in any case and kept if new: a branch would be guessed wrong too often
+        # always written, and kept if new: a branch would be mispredicted too often
         moved[3 * out] = a[j]
         moved[3 * out + 1] = b[j]
         moved[3 * out + 2] = c[j]
@@ -120,8 +120,8 @@ def voxel_filter(
     """Append the kept rows to ``moved``.
 
     ``merge``: -1, or 0 to keep every point. ``settings``: 12 numbers of T, then 1 / voxel or 0, the squares of r_min
-    and r_max, a coordinate beyond reach, the sensor's voxel, where ranges are measured from. ``totals``: kept, not
-    finite, out of reach, cubes; they go on from call to call. One slot behind the table receives what is not kept.
+    and r_max, a coordinate beyond reach, the sensor's voxel, the origin of ranges. ``totals``: kept, not finite, out of
+    reach, cubes, accumulated over calls. One slot behind the table takes the points that are not kept.
     """
     ti.loop_config(serialize=True)
     for _ in range(1):

@@ -1,8 +1,8 @@
 # mypy: ignore-errors
-"""Taichi source of windows.py: products of 32 numbers at a time, four cells, kept in a local vector.
+"""Taichi source of windows.py: products of 32 numbers (four cells) at a time in a local vector.
 
 A store to an argument is never vectorised, a loop over a local vector is. Of 8, 16, 32 and 64 numbers only 32 become
-whole registers: 1.3 us a window of 33 x 33 cells, 5 us and more with the others.
+whole registers: 1.3 us for a window of 33 x 33 cells, 5 us and more with the others.
 """
 
 from coview_kernels import runtime
@@ -20,9 +20,9 @@ WHOLES = ti.types.ndarray(i32, 1)
 def products(
     raster: BYTES, wide: i32, images: BYTES, stride: i32, spans: WHOLES, first: WHOLES, which: WHOLES, out: WHOLES
 ):
-    """Sum the products of windows that begin at ``first``, a number in the raster; rows are ``stride`` numbers long.
+    """Sum the products of windows that begin at index ``first`` of the raster; rows are ``stride`` numbers long.
 
-    ``spans``: of each row of the images the first chunk of LANES that is not all 0, and the one behind the last.
+    ``spans``: for each row of the images, the first chunk of LANES that is not all 0, and the chunk after the last.
     """
     if ti.static(SERIAL):
         ti.loop_config(serialize=True)

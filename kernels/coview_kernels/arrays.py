@@ -29,9 +29,9 @@ class PolarGrid(NamedTuple):
     max_height: F32
     """(..., R, S) greatest height above the centre, metres."""
     count: I32  # type: ignore[assignment]  # hides tuple.count, which is not needed here
-    """(..., R, S) number of points; alone tells occupied bins from empty ones, since 0 is a valid height."""
+    """(..., R, S) number of points, which alone shows that a bin is occupied, as 0 is a valid height."""
     mean_height: F32 | None = None
-    """(..., R, S) mean height above the centre, metres, for :func:`paper_context`; None where not asked for."""
+    """(..., R, S) mean height above the centre, metres, for :func:`paper_context`; None if not requested."""
 
 
 class Raster(NamedTuple):
@@ -84,13 +84,13 @@ def _as_array(name: str, value: npt.ArrayLike, dtype: Any, shape: tuple[int | No
 
 
 def check_same_shape(name: str, array: npt.NDArray[Any], other: str, shape: tuple[int, ...]) -> None:
-    """Raise ValueError unless ``array`` has ``shape``, which is that of ``other``."""
+    """Raise ValueError unless ``array`` has the ``shape`` of ``other``."""
     if array.shape != shape:
         raise ValueError(f"{name} has shape {array.shape}, but {other} has {shape}")
 
 
 def check_grid_size(rings: int, sectors: int, r_max: float) -> None:
-    """Raise ValueError unless ``r_max`` is finite and positive, with 1 to 100,000 bins: float32 resolves so many."""
+    """Raise ValueError unless ``r_max`` is finite and positive, with 1 to 100,000 bins, which float32 resolves."""
     if rings < 1 or sectors < 1 or rings * sectors > 100_000:
         raise ValueError(f"rings and sectors must be at least 1, with 100,000 bins at most, got {rings} and {sectors}")
     if not (math.isfinite(r_max) and r_max > 0):

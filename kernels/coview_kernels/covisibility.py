@@ -1,6 +1,6 @@
-"""Co-view descriptors (eqs 1-4): the bins that are visible from the ground and from above, ours and the paper's.
+"""Co-view descriptors (eqs 1-4), ours and the paper's: the bins that are visible from the ground and from above.
 
-A few grids, as a keyframe has them, are described in NumPy on every backend: a launch takes longer.
+NumPy describes few grids, such as a keyframe's, on every backend, because a launch takes longer.
 """
 
 from __future__ import annotations
@@ -17,21 +17,21 @@ from coview_kernels.arrays import F32, I32, check_same_shape
 from coview_kernels.launch import Launch
 from coview_kernels.warm_up import compiled_by
 
-_MIN_BINS = 10_000  # for a kernel to be quicker: 8 grids of 20 x 60 (measured)
+_MIN_BINS = 10_000  # from which a kernel is faster, 8 grids of 20 x 60 (measured)
 _NOT_READ: F32 = np.zeros(1, dtype=np.float32)
 
 
 def paper_context(max_height: npt.ArrayLike, count: npt.ArrayLike, mean_height: npt.ArrayLike) -> F32:
-    """Eqs 1-4 of the paper as printed: the co-view context.
+    """Return the paper's co-view context, eqs 1-4 as printed.
 
-    A bin is occupied where its count is positive. It is *horizontally* co-visible (eqs 1 and 2) if no nearer bin of
-    its sector hides it: from the centre outwards, rings i = 1..R, the first occupied bin of a sector is visible and
-    becomes the horizon; an occupied bin at or above the horizon, h >= i * h_vis / i_vis, is visible and becomes the
-    next. It is *vertically* co-visible (eq. 3) if it is occupied and its density, the count, is at least the mean count
-    over all R x S bins, empty ones included. By eq. 4 a bin has
+    A bin is occupied if its count is positive. It is *horizontally* co-visible (eqs 1 and 2) if no nearer bin of its
+    sector hides it: from the centre outwards, rings i = 1..R, the first occupied bin of a sector is visible and becomes
+    the horizon; an occupied bin at or above the horizon, h >= i * h_vis / i_vis, is visible and becomes the next. It is
+    *vertically* co-visible (eq. 3) if it is occupied and its density, the count, is at least the mean count over all
+    R x S bins including empty ones. By eq. 4 a bin has
 
-    * its greatest height where it is horizontally, but not vertically co-visible;
-    * its mean height where it is both;
+    * its greatest height if it is horizontally but not vertically co-visible;
+    * its mean height if it is both;
     * 0 otherwise.
 
     Args:
@@ -52,14 +52,14 @@ def paper_context(max_height: npt.ArrayLike, count: npt.ArrayLike, mean_height: 
 
 
 def coview(max_height: npt.ArrayLike, count: npt.ArrayLike) -> F32:
-    """Our co-view context: the bins that are visible from the ground *or* dense, with their greatest heights.
+    """Return our co-view context: bins that are visible from the ground *or* dense, with their greatest heights.
 
-    Unlike :func:`paper_context` it keeps dense bins behind a wall, takes no means, and leaves out bins that lie on the
-    line of sight itself, as flat ground does.
+    Unlike :func:`paper_context` it keeps dense bins behind a wall, has no means, and leaves out bins on the line of
+    sight itself, such as flat ground.
 
     Args:
         max_height: (..., R, S) float32, metres above the viewpoint (or the ground below it); ignored in empty bins.
-        count: (..., R, S) int32, of voxels: counts of raw points depend on the scan pattern.
+        count: (..., R, S) int32 of voxels, as counts of raw points depend on the scan pattern.
 
     Returns:
         (..., R, S) float32, metres.
@@ -81,7 +81,7 @@ def _checked(max_height: npt.ArrayLike, count: npt.ArrayLike) -> tuple[F32, I32]
 
 
 def _described(paper: bool, plain: Callable[[F32, I32, F32], F32], height: F32, count: I32, mean: F32) -> F32:
-    """Describe grids by our rule or the paper's, in NumPy where they are few."""
+    """Describe grids by our rule or the paper's, in NumPy if they are few."""
     if count.size < _MIN_BINS:
         return plain(height, count, mean)
 

@@ -1,7 +1,7 @@
 """Points around a place, cut out of a map and sorted for searching in the same pass.
 
-A crop of 250,000 points takes 10 MB, which the system hands out page by page, at a millisecond for 4 MB. One piece of
-memory for all arrays gets larger pages.
+A crop of 250,000 points takes 10 MB, which the system allocates page by page, 4 MB per millisecond. One piece of memory
+for all arrays gets larger pages.
 """
 
 from __future__ import annotations
@@ -22,16 +22,16 @@ from coview_kernels.warm_up import compiled_by
 __all__ = ["Crop", "Cut", "crop_points"]
 
 MAX_POINTS = (1 << 31) // 3 - 1
-"""Points of a map: kernels count its coordinates in int32."""
+"""Greatest number of points in a map, as kernels count its coordinates in int32."""
 
 
 def crop_points(points: F32, normals: I8, spans: npt.ArrayLike, cut: Cut) -> Crop | None:
-    """Cut the points around a place out of a map; None where there is no point.
+    """Cut the points around a place out of a map; None if there are none.
 
     Args:
         points: (N, 3) float32, contiguous, metres; rows with NaN or inf are left out.
-        normals: (N, 3) int8, contiguous, normals as long as the planarity around each point, times 127.
-        spans: (S, 2) first row of each stretch of the map to look at, and the row after the last; no row twice.
+        normals: (N, 3) int8, contiguous, unit normals times the planarity around each point times 127.
+        spans: (S, 2) first row of each stretch of the map to search, and the row after its last; no row twice.
         cut: the circle to cut out.
 
     Raises:
@@ -63,7 +63,7 @@ _sort = Launch(
     *("crop", "sort", _NO[np.float32], _NO[np.int8], _NO[np.int32], np.zeros(11)),
     *(_NO[np.int32], _NO[np.int32], _NO[np.int32], _NO[np.float32]),
 )
-_cells: I32 = np.empty(1 << 16, dtype=np.int32)  # of a crop's points, to work with
+_cells: I32 = np.empty(1 << 16, dtype=np.int32)  # of a crop's points; working memory
 
 
 def _crop(points: F32, normals: I8, spans: I32, cut: Cut) -> Crop | None:
@@ -90,7 +90,7 @@ def _crop(points: F32, normals: I8, spans: I32, cut: Cut) -> Crop | None:
 
 
 def _arena(*parts: tuple[int, Any]) -> list[npt.NDArray[Any]]:
-    """Return arrays of so many numbers of a four-byte kind, in one piece of memory."""
+    """Return arrays of given lengths and four-byte types in one piece of memory."""
     ends = np.cumsum([-(-number // 16) * 16 for number, _ in parts])  # each begins a cache line
     memory = np.empty(int(ends[-1]), dtype=np.int32)
     begins = (0, *ends[:-1])

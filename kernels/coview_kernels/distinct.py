@@ -1,4 +1,4 @@
-"""The best of many poses that differ from each other in place or heading."""
+"""Selection of the best poses that differ from each other in place or heading."""
 
 from __future__ import annotations
 
@@ -14,12 +14,12 @@ from coview_kernels.warm_up import SAMPLE, compiled_by
 
 
 def distinct_poses(positions: npt.ArrayLike, yaw: npt.ArrayLike, count: int, distance: float, turn: float) -> I64:
-    """Choose the first poses that differ from all chosen before: indices (K,), rising, at most ``count``.
+    """Choose the first poses that differ from all earlier choices; return at most ``count`` ascending indices (K,).
 
-    Two are one place if they are less than ``distance`` apart and turned by less than ``turn``.
+    Two poses are the same if they are less than ``distance`` apart and turned by less than ``turn``.
 
     Args:
-        positions: (N, 3) metres, the best first.
+        positions: (N, 3) metres, best first.
         yaw: (N,) radians.
         count: at least 1.
         distance: metres.
@@ -44,7 +44,7 @@ def distinct_poses(positions: npt.ArrayLike, yaw: npt.ArrayLike, count: int, dis
 
 _REALS, _WHOLES = np.zeros(1, dtype=np.float32), np.zeros(1, dtype=np.int32)
 _launch = Launch("distinct", "distinct", _REALS, _REALS, _WHOLES, _WHOLES, 0, 0, 0.0, 0.0)
-"""One is enough: only one call of native code runs at a time."""
+"""One launch for all calls, as only one call of native code runs at a time."""
 
 
 def _native(poses: F32, count: int, square: float, cosine: float) -> I64:

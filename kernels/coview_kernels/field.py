@@ -1,15 +1,15 @@
-"""Scores of hypotheses against a map's likelihood field, each moved to the best pose around it first.
+"""Scores of hypotheses against a map's likelihood field, each first moved to the best pose around it.
 
-A hypothesis is the pose of a scan: position and heading of a pivot in it. The kernel looks for the best shift and
-heading near each, coarse to fine, and for the height at which the scan's ground lies on the map's; then it counts the
-points that the map explains there (:class:`FieldScores`). It only looks up: no point is searched for.
+A hypothesis is the pose of a scan: position and heading of a pivot in the scan. The kernel finds the best shift and
+heading near each hypothesis, coarse to fine, and the height at which the scan's ground lies on the map's; then it
+counts the points that the map explains there (:class:`FieldScores`). It only looks up cells, and searches no points.
 
-1. coarse: some of the scan's structure on cells of a metre, at all shifts of up to three metres and seven headings up
-   to six degrees off: one pass over the points for each heading, since shifts are neighbouring cells.
-2. height: the mean difference of the map's ground and the scan's, twice.
-3. fine: the eight neighbours half a metre away, and two headings a degree off at the best; then the same at half these
-   steps. A point counts twice on half-metre cells with structure, once within half a metre of one.
-4. counts, with all points.
+1. Coarse: part of the scan's structure on cells of a metre, at all shifts of up to three metres and seven headings up
+   to six degrees off; one pass over the points per heading, as shifts are neighbouring cells.
+2. Height: the mean difference between the map's ground and the scan's, twice.
+3. Fine: the eight neighbours half a metre away, and two headings a degree off at the best; then the same with half
+   these steps. A point counts twice on half-metre cells with structure, once within half a metre of one.
+4. Counts, with all points.
 """
 
 from __future__ import annotations
@@ -31,20 +31,20 @@ from coview_kernels.reference.field import CELL, NOT_SURVEYED, TILE, FieldLayers
 from coview_kernels.warm_up import SAMPLE, compiled_by
 
 COARSE, FINE, LOW, LEVELS = 96, 160, 64, 2
-"""Points of the coarse level, of a fine one, and for the height; fine levels. With a third fewer points one of 24
-places was lost on one world; docs/results.md says how often the right place comes first."""
+"""Points of the coarse level, of a fine level and for the height; number of fine levels. With a third fewer points one
+of 24 places was lost in one world; docs/results.md says how often the right place comes first."""
 
-_MAX_TABLE = 1 << 21  # tiles of the rectangle that holds a map, 537 km2: kernels count in int32
-_MIDDLE = 1 << 31  # words of bits that a signed 32-bit index reaches from the first; beyond, it counts from the middle
-_BATCH = 512  # tiles at a time: intermediate arrays stay small
-_BAND = 16  # rows of tiles at a time, likewise
+_MAX_TABLE = 1 << 21  # tiles in a map's bounding rectangle, 537 km2: kernels count in int32
+_MIDDLE = 1 << 31  # words of bits that a signed 32-bit index reaches; on larger maps it counts from the middle
+_BATCH = 512  # tiles at a time, to keep intermediate arrays small
+_BAND = 16  # rows of tiles at a time, for the same reason
 
 Zeros = Callable[[str, tuple[int, ...], type[np.generic]], npt.NDArray[Any]]
-"""Makes a writable array of zeros for a layer, by name, shape and type."""
+"""Allocates a writable array of zeros for a layer, by name, shape and type."""
 
 
 class Move(Enum):
-    """How far hypotheses are moved to the best pose around them."""
+    """Range within which hypotheses are moved to the best pose around them."""
 
     NONE = "none"
     NEAR = "near"
@@ -54,12 +54,12 @@ class Move(Enum):
 
 
 class FieldScores(NamedTuple):
-    """Counts of a scan's points that the map explains at each of H hypotheses, at the best pose near it."""
+    """Counts of the scan's points that the map explains at the best pose near each of H hypotheses."""
 
     pose: F64
     """(H, 4) x, y, z of the pivot in the map, metres, and heading of the scan's frame, radians."""
     structure: I32
-    """(H,) structure points on surveyed cells; the next two are subsets of them."""
+    """(H,) structure points on surveyed cells; the next two are subsets."""
     near: I32
     """(H,) within about half a metre of map structure."""
     covered: I32
@@ -67,7 +67,7 @@ class FieldScores(NamedTuple):
     low: I32
     """(H,) ground points on surveyed cells."""
     grounded: I32
-    """(H,) low points on the map's ground."""
+    """(H,) ground points on the map's ground."""
     passed: I32
     """(H,) free points on map structure."""
     on: I32
@@ -76,14 +76,14 @@ class FieldScores(NamedTuple):
 
 @dataclass(frozen=True)
 class FieldScan:
-    """A level scan, relative to the pivot, metres; neighbours follow one another."""
+    """A levelled scan relative to the pivot, metres; neighbouring points follow one another."""
 
     structure: F32
     """(N, 3) points above the ground."""
     low: F32
     """(G, 3) points on the ground."""
     free: F32
-    """(F, 3) points that rays have passed through."""
+    """(F, 3) points in free space, which rays have passed."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -91,15 +91,15 @@ class FieldMap:
     """Rasters of a map in tiles of 32 x 32 cells of half a metre; row along y, column along x.
 
     Attributes:
-        tiles: (T, 3) int32 row and column of each tile, and the height in metres that its heights count from.
-        occupied: (T, 32, 32) int64; bit ``floor(2 z) mod 64`` is set where the cell has a point at height z.
+        tiles: (T, 3) int32 row and column of each tile, and the base of its heights, metres.
+        occupied: (T, 32, 32) int64; bit ``floor(2 z) mod 64`` is set if the cell has a point at height z.
         ground: (T, 32, 32) int16 centimetres above the tile's height, ``NO_GROUND`` or ``NOT_SURVEYED``.
         edge: (T, 32, 32) uint8 quarter metres above the tile's height, 0 for none.
-        stored: layers made before, perhaps memory-mapped; None makes them at first use.
+        stored: existing layers, perhaps memory-mapped; None builds them at first use.
 
     Raises:
-        ValueError: an array has another shape or type, the layers are not those of the tiles, or the map is too large
-            for the indices of a kernel.
+        ValueError: an array has a wrong shape or type, the layers do not match the tiles, or the map is too large for
+            the indices of a kernel.
     """
 
     tiles: I32
@@ -128,7 +128,7 @@ class FieldMap:
             self._check(self.stored)
 
     def _check(self, layers: FieldLayers) -> None:
-        """Compare layers with the tiles: a wrong table would make the kernel read elsewhere."""
+        """Compare layers with the tiles, as a wrong table would make the kernel read elsewhere."""
         table, base = self._table()
         tiles, (rows, columns) = len(base), table.shape
         for name, kind, shape in (
@@ -146,20 +146,20 @@ class FieldMap:
 
     @cached_property
     def corner(self) -> I64:
-        """(2,) row and column of the table's first tile, one before the first used one."""
+        """Row and column (2,) of the table's first tile, one before the first used tile."""
         return np.asarray(self.tiles[:, :2].min(axis=0, initial=1 << 30).astype(np.int64) - 1)
 
     @cached_property
     def layers(self) -> FieldLayers:
-        """The rasters that are looked up; 22 bytes a cell, made at first use unless they are stored."""
+        """Rasters for the look-ups, 22 bytes per cell, built at first use unless they are stored."""
         return self.made_layers() if self.stored is None else self.stored
 
     def made_layers(
         self, zeros: Zeros = lambda _, shape, kind: np.zeros(shape, kind), done: Callable[[], object] = lambda: None
     ) -> FieldLayers:
-        """Make the rasters, batch by batch, in arrays by ``zeros``; ``done`` is called after each batch.
+        """Build the rasters, batch by batch, in arrays from ``zeros``; ``done`` is called after each batch.
 
-        Where the arrays are mapped from files, ``done`` may release their memory.
+        If the arrays are mapped from files, ``done`` may release their memory.
         """
         table, base = self._table()
         tiles = len(base)
@@ -177,7 +177,7 @@ class FieldMap:
         return FieldLayers(table, base, bits, surface, coarse)
 
     def _table(self) -> tuple[I32, F32]:
-        """(R, C) number of each tile, 0 for none; (T + 1,) height that each counts from."""
+        """Return the number of each tile (R, C), 0 for none, and the base of its heights (T + 1,)."""
         shape = self.tiles[:, :2].max(axis=0, initial=0).astype(np.int64) - self.corner + 2
         table = np.zeros(np.maximum(shape, 2), dtype=np.int32)
         row, column = (self.tiles[:, :2] - self.corner).T
@@ -186,7 +186,7 @@ class FieldMap:
 
 
 def field_scores(field: FieldMap, scan: FieldScan, poses: npt.ArrayLike, move: Move = Move.FAR) -> FieldScores:
-    """Score hypotheses, each moved to the best pose around it first.
+    """Score hypotheses, each first moved to the best pose around it.
 
     Args:
         field: the map.
@@ -203,7 +203,7 @@ def field_scores(field: FieldMap, scan: FieldScan, poses: npt.ArrayLike, move: M
     plan = Plan(structure, low, free, *few, 0 if move is Move.NONE else LEVELS, move is Move.FAR)
     layers = field.layers
     corner = np.array([*field.corner[::-1] * (TILE * CELL), 0.0, 0.0])
-    # float32 resolves a tenth of a millimetre a kilometre from the corner
+    # float32 resolves a tenth of a millimetre at a kilometre from the corner
     pose, counts = start - corner, np.zeros((len(start), 7), dtype=np.int32)
     for rows in _groups(layers, pose):
         pose[rows], counts[rows] = runtime.dispatch(_native, reference.field_scores, layers, plan, pose[rows])
@@ -211,7 +211,7 @@ def field_scores(field: FieldMap, scan: FieldScan, poses: npt.ArrayLike, move: M
 
 
 def _groups(layers: FieldLayers, start: F64) -> Iterator[slice | I64]:
-    """Yield hypotheses to score together: all, or those of one window after another of a large mapped field.
+    """Yield hypotheses to score together: all of them, or on a large mapped field window by window.
 
     Pages of neighbouring windows that the scan reaches stay in memory until the last group is done.
     """
@@ -223,7 +223,7 @@ def _groups(layers: FieldLayers, start: F64) -> Iterator[slice | I64]:
         np.floor(start[:, 1::-1] / (TILE * CELL)).astype(np.int64), 0, np.array(layers.table.shape) - 1
     ).T
     tile = layers.table[rows, columns]
-    if len(np.unique(windows.number(tile))) <= 1:  # the surroundings of one robot: they stay in memory
+    if len(np.unique(windows.number(tile))) <= 1:  # the surroundings of one robot stay in memory
         yield slice(None)
         return
     for window in windows:
@@ -234,9 +234,9 @@ def _groups(layers: FieldLayers, start: F64) -> Iterator[slice | I64]:
 
 
 def unexplained(field: FieldMap, structure: F32, pose: npt.ArrayLike) -> Mask:
-    """Mask structure points (N, 3) at a pose (4,) on surveyed cells, neither near structure nor below an edge.
+    """Mask structure points (N, 3) that lie at a pose (4,) on surveyed cells, neither near structure nor below an edge.
 
-    Arguments are as for :func:`field_scores`. In NumPy: it is called for one pose, and seldom.
+    Arguments are those of :func:`field_scores`. Runs in NumPy, as calls are rare and have one pose.
     """
     surveyed, _, covered, _ = reference.structure_at(field.layers, *_from_corner(field, structure, pose))
     return np.asarray(surveyed & ~covered)
@@ -253,7 +253,7 @@ def near_structure(field: FieldMap, structure: F32, pose: npt.ArrayLike, shifts:
 
 
 def ground_heights(field: FieldMap, points: F32) -> F32:
-    """Height (N,) of the map's ground below or above points (N, 3), map frame, metres; NaN where there is none."""
+    """Return the ground height (N,) of the map below or above points (N, 3), map frame, metres; NaN without ground."""
     corner = np.array([*field.corner[::-1] * (TILE * CELL), 0.0]).astype(np.float32)
     return reference.ground_heights(field.layers, as_float32("points", points, None, 3) - corner)
 
@@ -281,12 +281,12 @@ def _native(layers: FieldLayers, plan: Plan, start: F64) -> tuple[F64, I32]:
 
 
 def _spread(points: F32, count: int) -> F32:
-    """Return ``count`` points, evenly spread, or all."""
+    """Return ``count`` evenly spaced points, or all."""
     return points[np.arange(count) * len(points) // count] if len(points) > count else points
 
 
 def _fill_near(bits: I64, table: I32, done: Callable[[], object]) -> None:
-    """Set the first bits of (T + 1, 32, 32, 2) at the second ones and at their six neighbours, half a metre away."""
+    """Set the first bits of (T + 1, 32, 32, 2) at the second bits and at their six neighbours half a metre away."""
     row, column = np.nonzero(table)
     for start in range(0, len(row), _BATCH):
         rows, columns = row[start : start + _BATCH], column[start : start + _BATCH]
@@ -306,12 +306,12 @@ def _fill_near(bits: I64, table: I32, done: Callable[[], object]) -> None:
 
 
 def _fill_coarse(planes: U16, bits: I64, table: I32, done: Callable[[], object]) -> None:
-    """Fill (32, W / 8, H) planes of cells of a metre, see :class:`FieldLayers`; set within a metre."""
+    """Fill planes (32, W / 8, H) of one-metre cells (:class:`FieldLayers`), set within a metre of structure."""
     half, (rows, columns) = TILE // 2, table.shape
     one, rest = np.uint32(1), np.uint32(31)
     for start in range(0, rows, _BAND):
         stop = min(start + _BAND, rows)
-        wide = slice(max(start - 1, 0), min(stop + 1, rows))  # a metre beyond the band would do, a tile has more
+        wide = slice(max(start - 1, 0), min(stop + 1, rows))  # a metre beyond the band is enough; a tile has more
         metres = _folded(bits, table[wide], done).transpose(0, 2, 1, 3).reshape(-1, columns * half)
         out = metres | (metres << one) | (metres >> rest) | (metres >> one) | (metres << rest)
         out[1:] |= metres[:-1]
@@ -327,7 +327,7 @@ def _fill_coarse(planes: U16, bits: I64, table: I32, done: Callable[[], object])
 
 
 def _folded(bits: I64, table: I32, done: Callable[[], object]) -> npt.NDArray[np.uint32]:
-    """(R, C, 16, 16) structure of a table's tiles in cells of a metre, a bit for each metre of height."""
+    """Return the structure (R, C, 16, 16) of a table's tiles in one-metre cells, one bit per metre of height."""
     half, tiles = TILE // 2, table.reshape(-1)
     folded = np.zeros((len(tiles), half, half), dtype=np.uint32)
     used = np.flatnonzero(tiles)
@@ -345,7 +345,7 @@ def _coarse_shape(rows: int, columns: int) -> tuple[int, int, int]:
 
 
 def _pairs(words: npt.NDArray[np.uint64]) -> npt.NDArray[np.uint32]:
-    """Fold 64 bits into 32: a bit is set where either of two neighbours is."""
+    """Fold 64 bits into 32: a bit is set if either of two neighbours is."""
     both = (words | (words >> np.uint64(1))) & np.uint64(0x5555555555555555)
     for shift, mask in (
         (1, 0x3333333333333333), (2, 0x0F0F0F0F0F0F0F0F), (4, 0x00FF00FF00FF00FF),
