@@ -1,11 +1,11 @@
-"""Trimmed point-to-plane ICP (eq. 13), coarse to fine, with weights against outliers and a prior.
+"""Trimmed point-to-plane ICP (eq. 13), coarse to fine, with robust weights and a prior.
 
-Where the map's points form no surface, in a crown or a hedge, a normal means nothing, and a pair constrains all three
-directions, each less exactly. The length of the map's normals weighs the two.
+Where the map's points form no surface, as in a crown or a hedge, a normal means nothing, and a pair constrains all
+three directions, each less precisely. The length of the map's normals weighs the two cases.
 
-An iteration is one prepared launch, whose searches are spread over the threads. A search also returns a lower bound of
-the distances of all other map points: while the point has moved less than that bound allows, its partner is the same
-(the triangle inequality; exact) and is looked up. Late iterations, which move the cloud by centimetres, hardly search.
+An iteration is one prepared launch, with its searches spread over the threads. A search also returns a lower bound of
+the distances of all other map points. While the point has moved less than this bound allows, its partner is the same
+(exactly, by the triangle inequality) and is not searched. Late iterations, with steps of centimetres, hardly search.
 """
 
 from __future__ import annotations
@@ -30,16 +30,16 @@ __all__ = ["SCATTER", "Prior", "Registration", "Scale", "align_planes"]
 _TOTAL, _STATUS, _CONVERGED, _INFORMATION, _SUMS = 14, 15, 16, 17, 53
 _LOST = 2
 _BINS = 2048
-_FAR = 1e18  # metres, where the partner of a point is that has none
+_FAR = 1e18  # metres: coordinate of a missing partner
 
 
 class Prior(NamedTuple):
-    """A Gaussian over the pose, by its information, as it may leave directions open."""
+    """A Gaussian prior of the pose, by its information matrix, which may leave directions free."""
 
     T_map_source: F64
     """(4, 4) mean."""
     information: F64
-    """(6, 6) over (rx, ry, rz, x, y, z): a rotation about the pivot, then a shift, along the map's axes."""
+    """(6, 6) over (rx, ry, rz, x, y, z): a rotation about the pivot, then a shift, in map axes."""
 
 
 def align_planes(
@@ -57,28 +57,28 @@ def align_planes(
 ) -> Registration | None:
     """Register points to a map of points with normals.
 
-    An iteration pairs every point with its nearest map point below the scale's radius; of either kind of point it keeps
-    the floor(keep * pairs) nearest pairs, at least one, and all as far as the last of them, to a hundredth. (Coarse
-    scales had better keep all: far from the end, the nearest pairs are those that hold a wrong pose.) Then it takes a
+    An iteration pairs every point with its nearest map point within the scale's radius. For each kind of point it keeps
+    the floor(keep * pairs) nearest pairs, at least one, and all pairs as far as the last of these, to a hundredth.
+    (Coarse scales should keep all: far from convergence, the nearest pairs support a wrong pose.) Then it takes a
     Gauss-Newton step on sum w r^2 + v |T p - q|^2, where r = n . (T p - q) with the unit normal n,
-    w = P share / (1 + (r / width)^2) and v = (1 - P) share / (4 + (|T p - q| / width)^2), with P the planarity. The
-    share makes both kinds weigh the same for any numbers of points, but is 5 at most. A coarse scale may take every
-    so-many-th point of either kind: the next scale goes on from its end.
+    w = P share / (1 + (r / width)^2) and v = (1 - P) share / (4 + (|T p - q| / width)^2), and P is the planarity. The
+    share, 5 at most, gives both kinds the same total weight for any numbers of points. A coarse scale may use every
+    n-th point of each kind; the next scale continues from its result.
 
     Args:
         grid: the map, (K, 3).
-        normals: (K, 3) float32, its normals, as long as the planarity around each point: 1 on a surface, 0 in scatter.
+        normals: (K, 3) float32, its unit normals times the planarity around each point, 1 on a surface, 0 in scatter.
         source: (N, 3) float32, source frame, metres. Rows with NaN or inf find no partner.
         kind: (N,) bool.
-        T: (4, 4) ``T_map_source`` to begin with.
+        T: (4, 4) initial ``T_map_source``.
         pivot: (3,) source-frame centre of rotations.
         scales: coarse to fine.
         iterations: maximum on each scale.
-        min_pairs: pairs that an answer needs, at least 1.
+        min_pairs: least number of pairs of an answer, at least 1.
         prior: fused with the normal equations of the pairs.
 
     Returns:
-        The pose with its evidence, or None where too few points find a partner.
+        The pose with its evidence, or None if too few points find a partner.
 
     Raises:
         ValueError: a shape is wrong, a pose not finite, or a setting out of its range; the message names it.
@@ -123,7 +123,7 @@ _launch = Launch(
     *("icp", "align", np.zeros(1), _WHOLES, _WHOLES, _REALS, _REALS, _WHOLES, np.zeros(1), _REALS, _WHOLES),
     *(np.zeros((6, 7)), np.zeros(1), 1),
 )
-"""One is enough: only one call of native code runs at a time."""
+"""One launch for all calls, as only one call of native code runs at a time."""
 
 
 def _align(grid: PointGrid, normals: F32, source: F32, kind: Mask, plan: Plan) -> Registration | None:
@@ -153,7 +153,7 @@ def _align(grid: PointGrid, normals: F32, source: F32, kind: Mask, plan: Plan) -
 
 
 def _by_scale(kind: Mask, scales: Sequence[Scale]) -> tuple[I64, I64]:
-    """Order (N,) of the points by the first scale that they take part in, and the number of points of each scale."""
+    """Return the order (N,) of the points by the first scale that uses them, and the number of points of each scale."""
     first = np.full(len(kind), len(scales))
     groups = np.flatnonzero(kind), np.flatnonzero(~kind)
     for k in reversed(range(len(scales))):
@@ -164,7 +164,7 @@ def _by_scale(kind: Mask, scales: Sequence[Scale]) -> tuple[I64, I64]:
 
 
 def _settings(frame: F64, plan: Plan, numbers: I64) -> F64:
-    """Return all constants of the kernel in one array: every argument costs 5 to 10 us."""
+    """Return all constants of the kernel in one array, as every argument costs 5 to 10 us."""
     values = np.zeros(63 + 6 * len(plan.scales))
     values[:8] = frame
     values[8:12] = plan.iterations, len(plan.scales), plan.min_pairs, plan.prior is not None

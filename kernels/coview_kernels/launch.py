@@ -1,10 +1,10 @@
-"""Launches of a kernel whose arguments stay, prepared once instead of at every call.
+"""Kernel launches with fixed arguments, prepared once instead of at every call.
 
-A call of a kernel costs 15 us in quadrants 1.3 and 36 in Taichi 1.7, and 5 to 20 us more for each argument (measured):
+A kernel call costs 15 us in quadrants 1.3 and 36 in Taichi 1.7, and 5 to 20 us more per argument (measured), because
 types are looked up, checked and converted every time. A :class:`Launch` sets the arguments once and afterwards costs
 4 us, plus 3 for an array that changes. Without it a filter of 20,000 points takes 1.7 times as long, an alignment of
-1,500 points 1.4 times, a small call 5 times (commit 731ba9db, bench/speed). It uses the library's own launch context,
-which is not public, so only that of the versions that it has been tested with; elsewhere it calls the kernel.
+1,500 points 1.4 times, a small call 5 times (commit 731ba9db, bench/speed). The library's launch context is not public,
+so a launch uses it only in tested versions, and otherwise calls the kernel.
 """
 
 from __future__ import annotations
@@ -16,43 +16,43 @@ import numpy as np
 from coview_kernels import runtime
 
 TESTED_VERSIONS = {"quadrants": ((1, 3), (1, 4)), "taichi": ((1, 7),)}
-"""Libraries of which the launch context is known."""
+"""Versions of the libraries whose launch context is known."""
 
 SPAN = 512
 """Iterations per chunk of a parallel loop.
 
-Both libraries cut a range into blocks of at least 512 iterations for any ``block_dim``: a loop over C
-chunks of work must run over ``C * SPAN`` and do the work in every SPAN-th iteration, or one thread does it all.
+Both libraries cut a range into blocks of at least 512 iterations for any ``block_dim``. A loop over C chunks of work
+must therefore run over ``C * SPAN`` and work in every SPAN-th iteration, or one thread does everything.
 """
 
 
 def tested(library: Any) -> bool:
-    """Tell whether this version's launch context is known."""
+    """Return whether the launch context of this version is known."""
     return tuple(library.__version__[:2]) in TESTED_VERSIONS.get(library.__name__, ())
 
 
 class Launch:
-    """Kernel of module ``_ti_<module>`` with its arguments; to be used on the owner thread, or as :meth:`ready` says.
+    """Kernel of module ``_ti_<module>`` with its arguments, for the owner thread, or others if :meth:`ready`.
 
-    The arrays must be C-contiguous and of the types that the kernel declares, numbers Python's own: they are not
-    checked. The arrays are kept alive here and may be written to between calls.
+    Arguments are not checked: arrays must be C-contiguous with the kernel's declared types, numbers Python's own. The
+    launch keeps the arrays alive; they may be written to between calls.
     """
 
     def __init__(self, module: str, name: str, *arguments: Any) -> None:
         self._name = (module, name)
         self._arguments = list(arguments)
-        self._program: Any = None  # ends with a shutdown, and the context with it
+        self._program: Any = None  # a shutdown ends it and the context
         self._context: Any = None
         self._compiled: Any = None
 
     def put(self, index: int, value: Any) -> None:
-        """Replace an argument, from now on."""
+        """Replace an argument for later calls."""
         self._arguments[index] = value
         if self._program is not None:
             _set_argument(self._context, index, value)
 
     def ready(self) -> bool:
-        """Tell whether the kernel has run before in the program that runs now: from then on any thread may call it."""
+        """Return whether the kernel has run in the current program, after which any thread may call it."""
         return self._program is not None and self._program is runtime.program()
 
     def __call__(self) -> None:
@@ -83,7 +83,7 @@ _compiled: dict[tuple[str, str], tuple[Any, Any, Any]] = {}
 
 
 def _forms(kernel: Any, program: Any) -> tuple[Any, Any]:
-    """Return the read and the compiled form of a kernel that has run: one, as all its types are declared."""
+    """Return the parsed and the compiled form of a kernel that has run; there is one, as all types are declared."""
     if runtime.library().__name__ == "quadrants":
         return next(iter(kernel.materialized_kernels.values())), next(iter(kernel.compiled_kernel_data_by_key.values()))
     native = next(iter(kernel.compiled_kernels.values()))

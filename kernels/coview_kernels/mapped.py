@@ -13,16 +13,16 @@ WINDOW = 1 << 25
 """Bytes of a window: 16 launches for half a gigabyte."""
 
 LARGE = 1 << 26
-"""Bytes from which an array is used by windows: a pass takes an eighth of a second for a gigabyte."""
+"""Least bytes of an array that is used by windows; a pass takes an eighth of a second per gigabyte."""
 
 _CAN_RELEASE = hasattr(mmap.mmap, "madvise") and hasattr(mmap, "MADV_DONTNEED")
 
 
 class Windows:
-    """Windows of an array (N, ...): one of all rows, unless it is mapped from a file and large.
+    """Windows of an array (N, ...); one window of all rows unless the array is large and mapped from a file.
 
-    Iterating yields slices of rows, and releases the pages of one before the next. The system keeps the file's pages as
-    long as it has room: reading them again takes no disk.
+    Iterating yields slices of rows, and releases the pages of each before the next. The system caches the file's pages
+    while it has room, so that reading them again needs no disk.
     """
 
     def __init__(self, array: npt.NDArray[Any]) -> None:
@@ -35,7 +35,7 @@ class Windows:
 
     @property
     def several(self) -> bool:
-        """Whether there is more than one."""
+        """Whether there is more than one window."""
         return self._step < self._rows
 
     def number(self, rows: npt.NDArray[np.int32]) -> npt.NDArray[np.int64]:
@@ -64,7 +64,7 @@ class Windows:
 
 
 def take_rows(array: npt.NDArray[Any], rows: npt.NDArray[np.int64]) -> npt.NDArray[Any]:
-    """Return a copy (K, ...) of rows (K,) of an array, window by window; IndexError if there is no such row."""
+    """Copy rows (K,) of an array to (K, ...), window by window; IndexError if a row does not exist."""
     if len(rows) and not 0 <= rows.min() <= rows.max() < len(array):
         raise IndexError(f"rows {rows.min()} to {rows.max()} of {len(array)}")
     out = np.empty((len(rows), *array.shape[1:]), dtype=array.dtype)
@@ -77,14 +77,14 @@ def take_rows(array: npt.NDArray[Any], rows: npt.NDArray[np.int64]) -> npt.NDArr
 
 
 def release(array: npt.NDArray[Any]) -> None:
-    """Release the memory of an array that is mapped from a file; it is read again on access."""
+    """Release the pages of an array that is mapped from a file; access reads them again."""
     whole = _map_of(array)
     if whole is not None:
         whole.madvise(mmap.MADV_DONTNEED)
 
 
 def _map_of(array: npt.NDArray[Any]) -> mmap.mmap | None:
-    """Return the file's map that an array lies in; None for an array in memory or a writable one."""
+    """Return the memory map that holds an array; None for an array in memory or a writable one."""
     base: Any = array
     if not _CAN_RELEASE or array.flags.writeable:  # changes of a private map would be lost
         return None

@@ -1,8 +1,8 @@
 """Nearest point of a cloud for many queries, by a grid over the cloud instead of a tree.
 
-Columns of cells stand side by side and a column's cells follow one another upwards, so the points of a stretch of a
-column are one stretch of memory. Map clouds are surfaces: a column holds few points and most queries look into one to
-four columns. Making the grid is one counting sort.
+The cells of a column follow one another upwards, so the points of a stretch of a column are one stretch of memory. Map
+clouds are surfaces: a column holds few points, and most queries look into one to four columns. One counting sort builds
+the grid.
 """
 
 from __future__ import annotations
@@ -29,13 +29,13 @@ _EYE = np.eye(4)
 
 @dataclass(frozen=True, eq=False)
 class PointGrid:
-    """A cloud to be searched by :func:`nearest`; the backend's index is made at the first search.
+    """A cloud for :func:`nearest`; the first search builds the backend's index.
 
     Attributes:
         points: (K, 3) float32, metres.
 
     Raises:
-        ValueError: the points have another shape or hold NaN or inf.
+        ValueError: the points have a wrong shape, or hold NaN or inf.
     """
 
     points: F32
@@ -48,7 +48,7 @@ class PointGrid:
 
     @classmethod
     def sorted(cls, points: F32, cells: Cells) -> PointGrid:
-        """Return the grid of finite points (K, 3) that have been sorted already."""
+        """Return the grid of finite points (K, 3) that are already sorted."""
         grid = cls.__new__(cls)
         vars(grid).update(points=points, cells=cells)
         return grid
@@ -59,7 +59,7 @@ class PointGrid:
         points = self.points
         if not len(points):
             return Cells(np.array([0.0, 0, 0, CELL, 1 / CELL, 1, 1, 1]), np.zeros(2, np.int32), np.empty(0, np.int32))
-        # by columns: twenty times as fast as along the first axis
+        # column by column, twenty times as fast as along the first axis
         low, high = (np.array([f(points[:, d]) for d in range(3)], dtype=np.float64) for f in (np.min, np.max))
         frame = grid_frame(low, high)
         starts = np.zeros(int(frame[5:].prod()) + 1, dtype=np.int32)
@@ -73,26 +73,25 @@ class PointGrid:
         """The points in a k-d tree, for the NumPy twin."""
         from scipy.spatial import cKDTree
 
-        # an unbalanced tree is built three times as fast and searched as fast
+        # an unbalanced tree takes a third of the time to build, and is searched as fast
         return cKDTree(self.points, balanced_tree=False, compact_nodes=False)
 
 
 def nearest(grid: PointGrid, queries: npt.ArrayLike, radius: float, T: npt.ArrayLike | None = None) -> tuple[F64, I64]:
-    """Find the nearest point of a cloud for each query, nearer than ``radius``; exact, with cKDTree.query's results.
+    """Find the nearest point of a cloud within ``radius`` of each query; exact, with cKDTree.query's results.
 
     Args:
         grid: the cloud.
         queries: (N, 3) float32, metres. Rows with NaN or inf find nothing.
         radius: metres (exclusive).
-        T: (4, 4) ``T_cloud_queries`` that moves the queries, in float64; None where they are in the cloud's frame.
+        T: (4, 4) ``T_cloud_queries`` that moves the queries, in float64; None if they are in the cloud's frame.
 
     Returns:
-        Distances (N,) float64, inf where there is no such point, and indices (N,) into the cloud, K there. Of points
-        equally near, any.
+        Distances (N,) float64, inf without such a point, and indices (N,) into the cloud, then K. Any of several
+        equally near points may be returned.
 
     Raises:
-        ValueError: ``queries`` or ``T`` has the wrong shape, ``radius`` is not finite and positive, or ``T`` not
-            finite.
+        ValueError: a shape is wrong, ``T`` is not finite, or ``radius`` is not finite and positive.
     """
     cloud = as_float32("queries", queries, None, 3)
     pose = None if T is None else as_finite64("T", T, 4, 4)
@@ -107,7 +106,7 @@ def nearest(grid: PointGrid, queries: npt.ArrayLike, radius: float, T: npt.Array
 
 _WHOLES = np.zeros(1, dtype=np.int32)
 _launch = Launch("nearest", "nearest", np.zeros(8), _WHOLES, _WHOLES, np.zeros((1, 3), np.float32), _EYE, 1.0, _EYE)
-"""One is enough: only one call of native code runs at a time."""
+"""One launch for all calls, as only one call of native code runs at a time."""
 
 
 def _nearest(grid: PointGrid, queries: F32, radius: float, T: F64 | None) -> tuple[F64, I64]:
@@ -121,7 +120,7 @@ def _nearest(grid: PointGrid, queries: F32, radius: float, T: F64 | None) -> tup
 
 
 SAMPLE_GRID = PointGrid.sorted(SAMPLE, Cells(np.ones(8), np.array([0, 2], np.int32), np.zeros(8, np.int32)))
-"""A sorted cloud for the calls of :func:`compiled_by`: few clouds are sorted here, most come so from the map."""
+"""A sorted cloud for the calls of :func:`compiled_by`, as most clouds come sorted from the map."""
 
 compiled_by("nearest", lambda: nearest(SAMPLE_GRID, SAMPLE, 1.0))
 compiled_by("PointGrid", lambda: nearest(PointGrid(SAMPLE), SAMPLE, 1.0))

@@ -1,4 +1,4 @@
-"""Clouds drawn from above: lowest points, ground, and the columns of cells, one pass over the points for each."""
+"""Clouds seen from above: lowest points, ground, and columns of cells, with one pass over the points each."""
 
 from __future__ import annotations
 
@@ -12,14 +12,14 @@ from coview_kernels.warm_up import SAMPLE, compiled_by
 
 
 def lowest_heights(points: npt.ArrayLike, grid: OverheadGrid) -> F32:
-    """Return the lowest height (H, W) of the points (N, 3) in each cell, metres; inf where there is no point."""
+    """Return the lowest height (H, W) of the points (N, 3) in each cell, metres; inf in empty cells."""
     return runtime.dispatch(_lowest, reference.lowest_heights, as_float32("points", points, None, 3), grid)
 
 
 def offsets_near(points: npt.ArrayLike, grid: OverheadGrid, level: F32, band: float) -> tuple[I64, F64]:
     """Count the points (N, 3) less than ``band`` metres from the level (H, W) of their cell.
 
-    Returns their numbers (H, W), and the sums (H, W) of their heights above it, metres.
+    Returns the counts (H, W), and the sums (H, W) of these points' heights above the level, metres.
     """
     cloud, levels = as_float32("points", points, None, 3), as_float32("level", level, *grid.shape)
     return runtime.dispatch(_near, reference.offsets_near, cloud, grid, levels, band)
@@ -33,17 +33,17 @@ def height_columns(
     Args:
         points: metres.
         grid: the cells.
-        ground: (h, w) height of the ground in cells ``ratio`` times as large, metres; bilinear between their middles.
+        ground: (h, w) ground height in cells ``ratio`` times as large, metres; bilinear between their centres.
         ratio: cells of the grid along the edge of a ground cell.
         step: height of a level, metres.
         bounds: lowest and highest height of the levels, and the height below which a point belongs to the ground.
 
     Returns:
-        (levels, H * W) uint8, 1 where a level of a cell is occupied, from height 0 on; (H * W) greatest height in
+        (levels, H * W) uint8, 1 for an occupied level of a cell, from height 0 on; (H * W) greatest height in
         [0, highest], metres; (H * W) uint8, 1 where ground was observed.
 
     Raises:
-        ValueError: an array has another shape or no cells, or the highest height is not a whole number of levels.
+        ValueError: an array has a wrong shape or no cells, or the highest height is not a whole number of levels.
     """
     cloud = as_float32("points", points, None, 3)
     level = as_float32("ground", ground, *(n // ratio for n in grid.shape))

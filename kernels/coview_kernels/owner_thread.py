@@ -1,4 +1,4 @@
-"""Daemon thread that runs calls from a queue, one after the other, for callers on any thread."""
+"""Daemon thread that runs queued calls one after the other, for callers on any thread."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ class StoppedError(Exception):
 
 
 class _Job:
-    """A call on its way through the queue."""
+    """A call in the queue."""
 
     __slots__ = ("call", "done", "error", "result")
 
@@ -30,18 +30,18 @@ class _Job:
         try:
             self.result = self.call()
         except BaseException as error:
-            self.error = error  # it is raised again on the caller's thread
+            self.error = error  # raised again on the caller's thread
         self.done.release()
 
 
 class OwnerThread:
-    """Thread that runs every call; a call from that thread itself runs at once. A hand-over costs 20 us."""
+    """Thread that runs every call; its own calls run at once. Handing over a call costs 20 us."""
 
     def __init__(self, name: str) -> None:
         self._jobs: queue.SimpleQueue[_Job | None] = queue.SimpleQueue()
         self._stopped = False
         self._busy = threading.Lock()  # held while a call runs
-        self._gate = threading.Lock()  # no job may enter the queue behind the one that ends the thread
+        self._gate = threading.Lock()  # no job may follow the job that ends the thread
         self._thread = threading.Thread(target=self._loop, name=name, daemon=True)
         self._thread.start()
 
@@ -51,7 +51,7 @@ class OwnerThread:
                 job.run()
 
     def call(self, fn: Callable[[], R]) -> R:
-        """Run ``fn()`` on the thread and return or raise what it does; StoppedError after :meth:`stop`."""
+        """Run ``fn()`` on the thread, and return its result or raise its error; StoppedError after :meth:`stop`."""
         if threading.current_thread() is self._thread:
             return fn()
         job = _Job(fn)
@@ -68,8 +68,8 @@ class OwnerThread:
     def here(self, fn: Callable[[], R]) -> R:
         """Run ``fn()`` on the caller's thread while no other call runs.
 
-        ``fn`` must be short and must not come back for :meth:`call` or :meth:`here`; nor may a signal handler of the
-        caller's, which would wait for the call that it interrupts.
+        ``fn`` must be short, and must not use :meth:`call` or :meth:`here`. Nor may a signal handler of the caller,
+        which would wait for the call that it interrupts.
         """
         if threading.current_thread() is self._thread:
             return fn()
@@ -77,7 +77,7 @@ class OwnerThread:
             return fn()
 
     def stop(self) -> None:
-        """Finish what is queued and end the thread; from the thread itself, end it after the current call."""
+        """Finish the queued calls and end the thread; from the thread itself, end it after the current call."""
         with self._gate:
             if not self._stopped:
                 self._stopped = True

@@ -14,19 +14,19 @@ from coview_kernels.launch import Launch
 from coview_kernels.reference.polar import cell_table, ring_edges2, sector_edges
 from coview_kernels.warm_up import SAMPLE, compiled_by
 
-_POINTS_PER_CHUNK = 8192  # fewer are done before another thread is awake
-_EXTRA = 3  # bins behind those of the grid: points outside, not finite, near an edge
+_POINTS_PER_CHUNK = 8192  # fewer points take less time than waking another thread
+_EXTRA = 3  # bins behind the grid's: points outside, not finite, near an edge
 _EMPTY: F32 = np.empty(0, dtype=np.float32)
 
 
 def polar_bin(
     points: npt.ArrayLike, centre: npt.ArrayLike, rings: int, sectors: int, r_max: float
 ) -> tuple[PolarGrid, int]:
-    """Greatest height, number and mean height of the points in rings x sectors around ``centre``.
+    """Bin points in rings x sectors around ``centre``: greatest height, number and mean height.
 
-    Height is z above ``centre``. Ring ``floor(r / (r_max / R))`` of the horizontal range r < ``r_max``; sector
-    ``floor(theta / (2 pi / S))`` of theta = atan2(dy, dx) in [0, 2 pi), counter-clockwise from the x axis.
-    :mod:`coview_kernels.reference.polar` says how edges are decided.
+    Height is z above ``centre``. The ring is ``floor(r / (r_max / R))`` for the horizontal range r < ``r_max``, the
+    sector ``floor(theta / (2 pi / S))`` for theta = atan2(dy, dx) in [0, 2 pi), counter-clockwise from the x axis.
+    :mod:`coview_kernels.reference.polar` defines the edges.
 
     Args:
         points: (N, 3) float32, metres.
@@ -36,7 +36,7 @@ def polar_bin(
         r_max: outer radius, metres.
 
     Returns:
-        The grid, (R, S) each, and the number of rows dropped because they hold NaN or inf.
+        The grid of arrays (R, S), and the number of rows dropped because of NaN or inf.
 
     Raises:
         ValueError: a shape or a number is out of its range.
@@ -52,7 +52,7 @@ def polar_bin(
 
 
 class _PolarBins:
-    """Bins, edges and results of one grid size, kept from call to call; for the owner thread only."""
+    """Bins, edges and results of one grid size, kept between calls; for the owner thread only."""
 
     def __init__(self, rings: int, sectors: int, r_max: float) -> None:
         self._chunks = runtime.workers()
@@ -103,15 +103,15 @@ def station_bins(
     r_max: float,
     raster_mean: npt.ArrayLike | None = None,
 ) -> PolarGrid:
-    """Virtual reference scans (VRS) of M stations, gathered from a raster of the base map.
+    """Gather the virtual reference scans (VRS) of M stations from a raster of the base map.
 
-    Station m stands at the centre of raster cell (rows[m], cols[m]) at height ground[m]; rows run along y, columns
-    along x. A raster cell counts as ``raster_count`` points at its centre: one table of (dx, dy) to bin, with the edges
-    of :func:`polar_bin`, serves all stations. Outside the raster there is nothing. The result takes 12 R S bytes a
-    station: hand over stations in portions.
+    Station m is at the centre of raster cell (rows[m], cols[m]) at height ground[m]; rows run along y, columns along x.
+    A raster cell counts as ``raster_count`` points at its centre, so that one table from (dx, dy) to bin, with the
+    edges of :func:`polar_bin`, serves all stations. Outside the raster there is nothing. The result takes 12 R S bytes
+    per station: pass stations in portions.
 
     Args:
-        raster_max: (H, W) float32 greatest height of each cell, metres; ignored where the count is 0.
+        raster_max: (H, W) float32 greatest height of each cell, metres; ignored if the count is 0.
         raster_count: (H, W) int32 points (occupied voxels) of each cell; 0 marks an empty cell.
         cell: edge of the raster cells, metres.
         rows: (M,) int32 row of each station.
@@ -120,10 +120,10 @@ def station_bins(
         rings: R, at least 1.
         sectors: S, at least 1.
         r_max: outer radius, metres.
-        raster_mean: (H, W) float32 mean height of each cell, metres; with it the grid has mean heights.
+        raster_mean: (H, W) float32 mean height of each cell, metres; adds mean heights to the grid.
 
     Returns:
-        The grid, (M, R, S) each; heights above the station's ground.
+        The grid of arrays (M, R, S), with heights above the station's ground.
 
     Raises:
         ValueError: shapes disagree, a station lies outside the raster, or a number is out of its range.
@@ -153,7 +153,7 @@ def _station_bins(
     d_row, d_col, bins = cell_table(cell, rings, sectors, r_max)
     starts = np.searchsorted(bins, np.arange(rings * sectors + 1)).astype(np.int32)
     reach = math.ceil(r_max / cell)
-    # a border as wide as the radius makes every neighbour a plain offset, without bounds checks
+    # with a border as wide as the radius every neighbour is a plain offset, without bounds checks
     empty = raster_count <= 0
     lowest = np.finfo(np.float32).min
     top = np.pad(np.where(empty, lowest, raster_max), reach, constant_values=lowest)

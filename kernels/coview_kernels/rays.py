@@ -1,7 +1,7 @@
 """First hits of rays on triangles, by a tree of boxes that halves the triangles at every level.
 
 The nodes are numbered as in a heap: 1 is the root, 2 n and 2 n + 1 are the children of n, and all leaves, equally
-full, are on the last level. So a ray needs no stack: siblings and parents follow from the number.
+full, are on the last level. A ray needs no stack, because siblings and parents follow from the number.
 """
 
 from __future__ import annotations
@@ -17,16 +17,16 @@ from coview_kernels.warm_up import SAMPLE, compiled_by
 
 
 class TriangleTree(NamedTuple):
-    """Triangles to be met by :func:`cast_rays`; made by :func:`triangle_tree`."""
+    """Triangles for :func:`cast_rays`, sorted by :func:`triangle_tree`."""
 
     boxes: F32
     """(2 L, 6) least and greatest x, y, z of each node of a tree with L leaves; the first row is not used."""
     axes: I32
-    """(L,) axis along which the children of a node lie side by side, the first one lower."""
+    """(L,) axis along which the children of a node lie side by side, the first child lower."""
     corners: F32
-    """(M, 9) corners of the triangles by leaf; some stand there twice, to fill the leaves."""
+    """(M, 9) corners of the triangles by leaf; some triangles appear twice to fill the leaves."""
     rows: I32
-    """(M,) their rows among the triangles given."""
+    """(M,) rows of these triangles among the given triangles."""
 
 
 def triangle_tree(vertices: npt.ArrayLike, triangles: npt.ArrayLike) -> TriangleTree:
@@ -37,19 +37,19 @@ def triangle_tree(vertices: npt.ArrayLike, triangles: npt.ArrayLike) -> Triangle
         triangles: (K, 3) int32, rows of vertices; K at least 1.
 
     Raises:
-        ValueError: an array has the wrong shape or NaN or inf, there is no triangle, or a row does not exist.
+        ValueError: an array has the wrong shape, NaN or inf, there is no triangle, or a row does not exist.
     """
     points, corners = as_float32("vertices", vertices, None, 3), as_int32("triangles", triangles, None, 3)
     if not len(corners) or not np.isfinite(points).all():
         raise ValueError("vertices hold NaN or inf, or there is no triangle")
     if corners.min() < 0 or corners.max() >= len(points):
         raise ValueError(f"triangles name vertices beyond {len(points)}")
-    levels = max(0, (len(corners) // 2).bit_length() - 1)  # two to four triangles a leaf
+    levels = max(0, (len(corners) // 2).bit_length() - 1)  # two to four triangles per leaf
     leaves = 1 << levels
     rows = np.resize(np.arange(len(corners), dtype=np.int32), leaves * -(-len(corners) // leaves))
     centres = points[corners].mean(axis=1)
     axes = np.zeros(leaves, dtype=np.int32)
-    for level in range(levels):  # each node's triangles are cut in the middle of its longest side
+    for level in range(levels):  # halve each node's triangles along its longest side
         nodes = centres[rows].reshape(1 << level, -1, 3)
         axis = (nodes.max(axis=1) - nodes.min(axis=1)).argmax(axis=1)
         axes[1 << level : 2 << level] = axis
@@ -68,10 +68,10 @@ def triangle_tree(vertices: npt.ArrayLike, triangles: npt.ArrayLike) -> Triangle
 
 
 def cast_rays(tree: TriangleTree, origins: npt.ArrayLike, directions: npt.ArrayLike) -> tuple[F32, I64]:
-    """Return the distance (N,) to the first triangle that each ray meets, and its row; inf and -1 where it meets none.
+    """Return the distance (N,) to the first triangle on each ray, and its row (N,); inf and -1 without a hit.
 
     Args:
-        tree: the triangles; either side of them is met.
+        tree: the triangles; rays hit both sides.
         origins: (N, 3) float32, metres.
         directions: (N, 3) float32 of unit length.
 

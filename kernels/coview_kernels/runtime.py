@@ -1,19 +1,19 @@
-"""Start, choice and end of the backend, in the only module that imports quadrants (or Taichi, which it is a fork of).
+"""Start, choice and end of the backend, in the only module that imports quadrants (a fork of Taichi) or Taichi.
 
-"Taichi" stands for either, here and elsewhere: both compile the same source. Quadrants comes first: it needs no system
-library but libc, and starts in half the time (commit 731ba9db, bench/speed).
+"Taichi" means either, here and elsewhere, as both compile the same source. Quadrants is preferred, because it needs no
+system library except libc and starts in half the time (commit 731ba9db, bench/speed).
 
 Taichi starts at the first kernel, not at import, and belongs to one thread: a program must be initialised and first
-launched on the same thread, and concurrent launches fail now and then. One daemon thread owns it and takes calls from
-a queue; callers, on any thread, wait for their result.
+launched on the same thread, and concurrent launches sometimes fail. One daemon thread owns it and takes calls from a
+queue; callers on any thread wait for their result.
 
-* ``COVIEW_KERNELS`` = ``quadrants``, ``taichi`` or ``numpy`` forces a backend; unset, the first usable one serves.
-* ``COVIEW_THREADS`` = 1, 2, ... bounds the threads of a kernel; unset, all cores of the process serve, up to 16.
-* A host program that has initialised Taichi keeps it: a second ``init`` would destroy its fields. We then take the
-  other library, if installed, or NumPy; likewise if the host initialises Taichi after us, which it must not do while
-  one of our kernels runs.
-* A forked child inherits Taichi's state without its threads and would hang: it computes in NumPy.
-* :func:`shutdown` ends the thread and frees Taichi; the next kernel starts both again. It runs at exit by itself.
+* ``COVIEW_KERNELS`` = ``quadrants``, ``taichi`` or ``numpy`` forces a backend; the default is the first usable one.
+* ``COVIEW_THREADS`` = 1, 2, ... bounds the threads of a kernel; the default is all cores of the process, up to 16.
+* A host program that has initialised Taichi keeps it, as a second ``init`` would destroy its fields. We then use the
+  other library, if installed, or NumPy. The same holds if the host initialises Taichi after us, which it must not do
+  while one of our kernels runs.
+* A forked child computes in NumPy, as it inherits Taichi's state without its threads and would hang.
+* :func:`shutdown` ends the thread and frees Taichi; the next kernel starts both again. It also runs at exit.
 """
 
 from __future__ import annotations
@@ -45,8 +45,8 @@ P = ParamSpec("P")
 R = TypeVar("R")
 
 _BACKENDS = ("quadrants", "taichi", "numpy")
-_STALE_LOCK = 60.0  # seconds; the cache is locked for milliseconds
-_MAX_WORKERS = 16  # the kernels are bound by memory; more threads only add private bins to merge
+_STALE_LOCK = 60.0  # seconds; the library locks the cache for milliseconds
+_MAX_WORKERS = 16  # memory bounds the kernels; more threads only add private bins to merge
 
 
 class _DisplacedError(Exception):
@@ -90,22 +90,22 @@ _backend: str | None = None
 
 
 def _import(name: str) -> ModuleType:
-    if os.name == "posix" and not os.environ.get("HOME"):  # as in a service: Taichi would end the process
-        os.environ.pop("HOME", None)  # an empty one would hide the password database's
+    if os.name == "posix" and not os.environ.get("HOME"):  # as in a service; Taichi would end the process
+        os.environ.pop("HOME", None)  # an empty value would hide the password database
         home = os.path.expanduser("~")  # noqa: PTH111  # Path raises for a user who has none
         os.environ["HOME"] = home if os.access(home, os.W_OK) else str(_folder_for_this_process())
-    # the import prints a banner otherwise; a user's own setting stays
+    # suppress the banner of the import, unless the user has set this
     os.environ.setdefault(f"ENABLE_{name.upper()}_HEADER_PRINT", "0")
-    os.environ.setdefault("TI_SKIP_VERSION_CHECK", "ON")  # else Taichi asks over the network, once a day
+    os.environ.setdefault("TI_SKIP_VERSION_CHECK", "ON")  # else Taichi asks over the network once a day
     with _quick_frames():
         return importlib.import_module(name)
 
 
 @contextlib.contextmanager
 def _quick_frames() -> Iterator[None]:
-    """Answer this thread's ``inspect.getframeinfo`` from the frame alone, without a look at every module.
+    """Answer this thread's ``inspect.getframeinfo`` from the frame alone, without searching every module.
 
-    The library asks it for the line of every function that it decorates, its own and ours: a third of its import.
+    The library calls it for the line of every function that it decorates, which takes a third of its import.
     """
     original, ours = inspect.getframeinfo, threading.get_ident()
 
@@ -130,18 +130,18 @@ def _program(library: Any) -> Any:
 
 
 def _init(library: Any) -> None:
-    # init prints a line at every log level. A name in its module hides the builtin there, and only
-    # there: redirecting sys.stdout would swallow what other threads print meanwhile.
+    # init prints a line at every log level. A name in its module hides the builtin only there; redirecting sys.stdout
+    # would also swallow the output of other threads.
     misc = library.lang.misc
     misc.print = lambda *args, **kwargs: None
     folder = _cache_folder(library)
     _remove_stale_lock(folder)
-    library.set_logging_level(library.ERROR)  # that of init comes too late for the folder's environment variable
+    library.set_logging_level(library.ERROR)  # init's level comes too late for the folder's environment variable
     try:
         library.init(
             arch=library.cpu,
             cpu_max_num_threads=workers(),
-            fast_math=False,  # the twins agree to the bit on edges; measured to cost nothing here
+            fast_math=False,  # the twins agree exactly on edges; this costs nothing measurable
             log_level="error",
             offline_cache_file_path=str(folder),
         )
@@ -151,10 +151,11 @@ def _init(library: Any) -> None:
 
 @functools.cache
 def _cache_folder(library: Any) -> Path:
-    """Return the folder of compiled kernels: quadrants' own, as one finds a kernel by its source (see :func:`kernel`).
+    """Return the folder of compiled kernels; for quadrants a subfolder, as it finds a kernel by its source.
 
-    That hash knows the functions of a kernel but not the constants that these use, so all our sources name the folder.
-    Its native code is loaded as it is: where others may write, all is compiled anew in a folder of this process.
+    That search (see :func:`kernel`) covers a kernel's functions but not their constants, so a hash of all our sources
+    names the subfolder. Its native code is loaded unchecked: if others may write there, a folder of this process is
+    used, and all kernels are recompiled.
     """
     quadrants = library.__name__ == "quadrants"
     named = os.environ.get(f"{'QD' if quadrants else 'TI'}_OFFLINE_CACHE_FILE_PATH")
@@ -171,13 +172,13 @@ def _cache_folder(library: Any) -> Path:
                 each.mkdir(mode=0o700, exist_ok=True)
         with tempfile.TemporaryFile(dir=folder) as file:
             file.write(bytes(1 << 16))
-    except OSError:  # a full disk, or one that only reads: quadrants would raise
+    except OSError:  # a full or read-only disk, on which quadrants would raise
         return _folder_for_this_process()
     return folder if is_private(folder) else _folder_for_this_process()
 
 
 def mark_of(names: Sequence[str]) -> Path | None:
-    """Return the file that says that kernels have been stored for processes like this one; None if none are kept."""
+    """Return the file that marks kernels as stored for processes like this one; None if kernels are not kept."""
     name = _choose()
     if _backend is not None or name == "numpy":
         return None
@@ -201,7 +202,7 @@ def _folder_for_this_process() -> Path:
 
 
 def is_private(folder: Path) -> bool:
-    """Tell whether this user, or root, alone may put files into a folder, or another folder into its place."""
+    """Return whether only this user or root may put files into a folder, or replace the folder."""
     if os.name != "posix":
         return True
     folder = folder.resolve()
@@ -210,14 +211,14 @@ def is_private(folder: Path) -> bool:
         if status.st_uid not in (0, os.geteuid()):
             return False
         if each != folder and status.st_mode & stat.S_ISVTX and status.st_uid == 0:
-            continue  # as /tmp: only owners rename there
+            continue  # like /tmp, where only owners rename
         if status.st_mode & stat.S_IWOTH or (status.st_mode & stat.S_IWGRP and not _is_own_group(status.st_gid)):
             return False
     return True
 
 
 def _is_own_group(number: int) -> bool:
-    """Tell whether a group is of this user alone, as on systems where files have mode 664."""
+    """Return whether a group has only this user, as on systems where files have mode 664."""
     import grp
     import pwd
 
@@ -229,7 +230,7 @@ def _is_own_group(number: int) -> bool:
 
 
 def kernel(function: Callable[..., Any]) -> Any:
-    """Decorate the source of a kernel, in its module; quadrants then finds the compiled form without reading it."""
+    """Decorate the source of a kernel in its module, so that quadrants finds the compiled form without parsing it."""
     decorate = library().kernel
     return decorate(fastcache=True)(function) if library().__name__ == "quadrants" else decorate(function)
 
@@ -237,7 +238,7 @@ def kernel(function: Callable[..., Any]) -> Any:
 def _remove_stale_lock(folder: Path) -> None:
     """Remove the lock that a killed process has left on the cache of compiled kernels.
 
-    The library holds it for an instant, and does without the cache while it is there: every start would compile.
+    The library holds the lock for an instant, and ignores the cache while it exists, so every start would compile.
     """
     for lock in (folder / "ticache.lock", folder / "qdcache.lock"):
         with contextlib.suppress(OSError):
@@ -251,7 +252,7 @@ def cores() -> int:
 
 
 def workers() -> int:
-    """Return the number of threads of a kernel; ValueError if ``COVIEW_THREADS`` is no whole number from 1 up."""
+    """Return the number of threads of a kernel; ValueError if ``COVIEW_THREADS`` is no positive whole number."""
     asked = os.environ.get("COVIEW_THREADS", "")
     if not asked:
         return min(_MAX_WORKERS, cores())
@@ -261,14 +262,14 @@ def workers() -> int:
 
 
 def library() -> Any:
-    """Return the initialised Taichi module, for the modules of kernels to build on."""
+    """Return the initialised Taichi module, for modules of kernels."""
     if _owner is None:
         raise RuntimeError("kernel modules are imported by runtime.kernels, on the owner thread")
     return _owner.library
 
 
 def program() -> Any:
-    """Return the initialised program of :func:`library`; kernels compiled for another one are void."""
+    """Return the initialised program of :func:`library`; kernels compiled for another program are invalid."""
     return _program(library())
 
 
@@ -282,12 +283,12 @@ def kernels(name: str) -> Any:
 
 
 def _usable(name: str) -> bool:
-    """Tell whether the library can be imported and has no program of the host's."""
+    """Return whether the library can be imported and has no program of the host."""
     if importlib.util.find_spec(name) is None:
         return False
     try:
         return _program(_import(name)) is None
-    except (ImportError, OSError):  # a wheel for another system: the NumPy twins serve
+    except (ImportError, OSError):  # also a wheel for another system
         return False
 
 
@@ -317,7 +318,7 @@ def backend() -> str:
             name = _choose()
             if name != "numpy":
                 _owner = _Backend(name)
-                # registered after the import of Taichi, so that it runs before Taichi's own exit handler
+                # registered after the import of Taichi, to run before Taichi's own exit handler
                 atexit.unregister(_at_exit)
                 atexit.register(_at_exit)
             _backend = name
@@ -327,7 +328,7 @@ def backend() -> str:
 def submit(fn: Callable[P, R], *args: P.args, **kwargs: P.kwargs) -> R:
     """Run ``fn(*args, **kwargs)`` on the thread that may launch kernels, and return its result or raise its error.
 
-    Callable from any thread, the owner included. With the NumPy backend ``fn`` runs on the caller's.
+    Any thread may call this, also the owner. With the NumPy backend ``fn`` runs on the caller's thread.
     """
     while True:
         backend()
@@ -336,13 +337,13 @@ def submit(fn: Callable[P, R], *args: P.args, **kwargs: P.kwargs) -> R:
             return fn(*args, **kwargs)
         try:
             return owner.call(lambda: fn(*args, **kwargs))
-        except StoppedError:  # a shutdown came between
+        except StoppedError:  # a shutdown came first
             with _lock:  # wait for its end, then start again
                 continue
 
 
 def dispatch(native: Callable[P, R], plain: Callable[P, R], *args: P.args, **kwargs: P.kwargs) -> R:
-    """Run ``native`` on the owner thread where Taichi runs, else its twin ``plain`` on the caller's thread."""
+    """Run ``native`` on the owner thread if Taichi runs, else its twin ``plain`` on the caller's thread."""
     global _owner, _backend
     if backend() == "numpy":
         return plain(*args, **kwargs)
@@ -367,8 +368,8 @@ def dispatch_here(
 ) -> R:
     """Dispatch as :func:`dispatch` does, but run ``native`` on the caller's thread if ``ready()``; the owner waits.
 
-    For short kernels: waking the owner, and then the caller again, takes 0.25 ms where cores sleep. ``native`` may only
-    launch kernels that are prepared (:meth:`coview_kernels.launch.Launch.ready`), and hands nothing to the owner.
+    For short kernels: waking the owner, and then the caller, takes 0.25 ms if cores sleep. ``native`` may only launch
+    prepared kernels (:meth:`coview_kernels.launch.Launch.ready`), and hands nothing to the owner.
     """
     owner = _owner
     if owner is not None:
@@ -397,7 +398,7 @@ def shutdown() -> None:
 def _at_exit() -> None:
     global _backend
     shutdown()
-    _backend = "numpy"  # a daemon thread that still computes must not start Taichi in a dying interpreter
+    _backend = "numpy"  # a daemon thread that still computes must not start Taichi during interpreter exit
 
 
 def _after_fork() -> None:

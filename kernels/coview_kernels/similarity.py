@@ -1,7 +1,7 @@
 """Distance of a query to every candidate at every shift (eqs 7-9), exactly, by the correlation theorem.
 
-Descriptors are compared by the cosines of their columns (sectors). A turn by n sectors shifts the columns: all S shifts
-are one circular correlation per ring, i.e. a product per frequency, summed over the rings, and one inverse FFT. BLAS
+Descriptors are compared by the cosines of their columns (sectors). A turn by n sectors shifts the columns, so all S
+shifts are one circular correlation per ring: a product per frequency, summed over the rings, and one inverse FFT. BLAS
 does the product at the speed of memory; a Taichi version was several times slower, so NumPy serves every backend.
 
 One query, 9,527 candidates of 20 x 60, two shared cores (commit 731ba9db, bench/speed):
@@ -27,7 +27,7 @@ _BATCH = 1024  # candidates transformed at a time: 1.2 MB per 20 x 60 spectrum a
 
 
 def _fft() -> Any:
-    """NumPy's transforms; before 2.0 they answer in complex128, so SciPy's, at 0.4 s for their import."""
+    """Return NumPy's transforms, or before 2.0, where they return complex128, SciPy's (0.4 s to import)."""
     if np.lib.NumpyVersion(np.__version__) >= "2.0.0":
         return np.fft
     from scipy import fft
@@ -40,14 +40,14 @@ def unit_columns(desc: npt.ArrayLike) -> F32:
     columns = np.asarray(desc, dtype=np.float32)
     if columns.ndim < 2:
         raise ValueError(f"desc has shape {columns.shape}, expected (..., rings, sectors)")
-    # float64, or the squares of small heights vanish and a column that has a direction counts as empty
+    # float64, or the squares of small heights would underflow, and a column with a direction would count as empty
     norm = np.sqrt(np.einsum("...rs,...rs->...s", columns, columns, dtype=np.float64))[..., None, :]
     unit: F32 = np.divide(columns, norm, out=np.zeros_like(columns), where=norm > 0, casting="same_kind")
     return unit
 
 
 def column_spectra(desc: npt.ArrayLike) -> C64:
-    """Spectra over the sectors of the unit columns of (M, R, S) descriptors; ValueError unless there are three axes.
+    """Return the spectra over the sectors of unit columns of descriptors (M, R, S); ValueError unless 3 axes.
 
     Returns (F, M, R) complex64 with F = S // 2 + 1; each frequency is one contiguous matrix.
     """
@@ -62,18 +62,18 @@ def column_spectra(desc: npt.ArrayLike) -> C64:
 
 
 def all_shift_distance(query: npt.ArrayLike, spectra: C64, sectors: int) -> F32:
-    """Eqs 7-9: distance of a query to M candidates at all S shifts.
+    """Return the distance (eqs 7-9) of a query to M candidates at all S shifts.
 
-    ``d[m, n] = 1 - (1 / S) sum_j q_unit[:, (j + n) % S] . c_unit[m][:, j]``; a column that is empty on either
-    side costs 1, so a near-empty descriptor cannot win by default.
+    ``d[m, n] = 1 - (1 / S) sum_j q_unit[:, (j + n) % S] . c_unit[m][:, j]``; a column that is empty on either side
+    costs 1, so that a nearly empty descriptor cannot win by default.
 
-    At shift n sector j of the candidate meets sector j + n of the query. With candidates binned in the axes of the map
-    and the query in those of the robot, the map heading (yaw) of the query's x axis is **-2 pi n / S** radians.
+    At shift n sector j of the candidate meets sector j + n of the query. With candidates binned in map axes and the
+    query in the robot's axes, the map heading (yaw) of the query's x axis is **-2 pi n / S** radians.
 
     Args:
         query: (R, S) descriptor, or (Q, R, S); normalised here.
         spectra: (F, M, R) complex64 from :func:`column_spectra`.
-        sectors: S; the spectra alone do not tell an even number from the odd one above it.
+        sectors: S; the spectra alone do not distinguish an even number from the odd one above it.
 
     Returns:
         (M, S) float32 in [0, 2], or (Q, M, S).
@@ -98,10 +98,10 @@ def all_shift_distance(query: npt.ArrayLike, spectra: C64, sectors: int) -> F32:
 
 
 def _products(spectra: C64, queries: C64) -> C64:
-    """(F, M, R) times (F, R, Q), in blocks of candidates that BLAS multiplies on the calling thread.
+    """Multiply (F, M, R) by (F, R, Q), in blocks of candidates that BLAS multiplies on the calling thread.
 
-    Larger products wake OpenBLAS's threads once per frequency: a third faster on idle cores (1.9 against 2.8 ms), but
-    on busy ones 31 wake-ups took 300 ms.
+    Larger products wake OpenBLAS's threads once per frequency, which is a third faster on idle cores (1.9 against
+    2.8 ms), but on busy cores 31 wake-ups took 300 ms.
     """
     frequencies, m, rings = spectra.shape
     block = max(1, _MAX_SERIAL // rings)

@@ -1,4 +1,4 @@
-r"""Correlation of a query with all stations from 512 bytes each (eqs 7-9), however many channels and rings they have.
+r"""Correlation of a query with all stations (eqs 7-9) by 512 bytes per station, for any number of channels and rings.
 
 The correlation at shift n is a sum over the frequencies f of :math:`Re(conj(c_f) . q_f e^{i 2 pi f n / S})`, where c
 and q are spectra of unit columns, all rings of all channels together. The codes keep the directions of most variance
@@ -9,10 +9,10 @@ is transformed likewise, at higher precision; its channels may be weighted.
 The loss is the same at every shift: right places keep nine tenths of their lead, and ``python -m bench city`` counts
 the right places that the search loses by it.
 
-Layout: a station is (16, 16) int16, rows by lanes. Rows 0 to 11 hold frequencies 0 to 15, rows 12 to 15 the higher
-ones; the first 8 lanes hold even frequencies, the others odd ones, which change their sign half a turn on: one sum
-serves two angles. The lower byte is the real part, the whole number in units of 256 the imaginary one: a product
-takes one shift at most, and no unpacking.
+A station is (16, 16) int16, rows by lanes. Rows 0 to 11 hold frequencies 0 to 15, rows 12 to 15 the higher frequencies.
+The first 8 lanes hold even frequencies, the others odd frequencies, which change sign after half a turn, so that one
+sum serves two angles. The lower byte is the real part, and the whole number in units of 256 is the imaginary part, so
+that a product takes one shift at most, and no unpacking.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ from coview_kernels.similarity import unit_columns
 from coview_kernels.warm_up import compiled_by
 
 ANGLES = 60
-"""Angles at which :meth:`StationCodes.best` looks."""
+"""Number of angles that :meth:`StationCodes.best` tries."""
 
 _LANES, _LOW, _HIGH = 16, 12, 4  # as in _ti_station_codes.py
 _ROWS = _LOW + _HIGH
@@ -43,9 +43,9 @@ _FREQUENCIES = 32
 _BATCH = 512  # stations transformed at a time
 _SAMPLE = 2048  # stations from which transform and steps are learned
 _INT8_RANGE = 6.0  # standard deviations that int8 spans: 5 to 8 differ by a tenth in error on simulated sites
-_MARGIN = 1.1  # beyond the greatest number of the sample
-_MAX_SUM = 32_500.0  # of int16, with room for what rounding adds
-_MIN_PARALLEL = 4096  # stations from which other threads are worth waking
+_MARGIN = 1.1  # range, as a multiple of the greatest number in the sample
+_MAX_SUM = 32_500.0  # of int16, with room for rounding errors
+_MIN_PARALLEL = 4096  # stations from which waking other threads pays
 _BEST, _PRODUCTS, _AT = range(3)  # launches
 _CHUNK = 4096  # pairs of station and shift at a time
 
@@ -63,10 +63,10 @@ class Screen(NamedTuple):
 
 @dataclass(frozen=True)
 class CodedQuery:
-    """A query in the stations' terms; ``step``, ``norm`` and ``sectors`` are those of :class:`StationCodes`."""
+    """A transformed query, with the ``step``, ``norm`` and ``sectors`` of :class:`StationCodes`."""
 
     numbers: C64
-    """(16, 16) its transform."""
+    """(16, 16) transform of the query."""
     step: F32
     norm: F32
     sectors: int
@@ -93,14 +93,14 @@ class CodedQuery:
 
     @cached_property
     def factors(self) -> F32:
-        """(16, 4, 16) of a station's numbers, for real and imaginary products without rounding."""
+        """Factors (16, 4, 16) of a station's numbers, for real and imaginary products without rounding."""
         p, s = self.numbers.real, self.numbers.imag
         real, whole = self.step[:, 0], self.step[:, 1] * np.float32(1.0 / 256.0)
         return np.ascontiguousarray(np.stack([p * real, s * whole, s * real, -p * whole], axis=1), dtype=np.float32)
 
     @cached_property
     def table(self) -> F32:
-        """(S, 16, 2, 16) of a station's numbers, for the correlation at every shift."""
+        """Factors (S, 16, 2, 16) of a station's numbers, for the correlation at every shift."""
         turned = self.numbers * _turns(self.sectors)
         table = np.empty((self.sectors, _ROWS, 2, _LANES), dtype=np.float32)
         np.multiply(turned.real, self.step[:, 0], out=table[:, :, 0])
@@ -112,24 +112,24 @@ _Request = tuple[CodedQuery, I32, I32]
 
 
 class StationCodes:
-    """M stations in 512 bytes each, to be compared with queries.
+    """Codes of M stations, 512 bytes each, for comparison with queries.
 
     Attributes:
-        codes: (M, 16, 16) int16; a memory map stays one, and only a window of a large one is in memory.
+        codes: (M, 16, 16) int16; a memory map is not copied, and only a window of a large map is in memory.
         basis: (16, 16, D) complex64 eigenvectors; D is rings times channels.
         step: (16, 2, 16) float32 value of one unit of int8, real and imaginary.
-        norm: (33,) float32 greatest norm of the integers of any station by frequency block, and of all its numbers.
+        norm: (33,) float32 greatest norm of any station's integers, by frequency block and of all its numbers.
         sectors: number of shifts S.
 
     Raises:
-        ValueError: more than ``MAX_STATIONS``.
+        ValueError: there are more than ``MAX_STATIONS``.
     """
 
     LEARNED = _SAMPLE
-    """Stations at most from which codes are learned."""
+    """Greatest number of stations from which codes are learned."""
 
     MAX_STATIONS = 2**31 // (_ROWS * _LANES) - 1
-    """The kernels number codes by 32 bits."""
+    """Greatest number of stations, as the kernels index codes with 32 bits."""
 
     def __init__(self, codes: I16, basis: C64, step: F32, norm: F32, sectors: int) -> None:
         if len(codes) > self.MAX_STATIONS:
@@ -142,14 +142,14 @@ class StationCodes:
 
     @classmethod
     def of(cls, descriptors: Sequence[npt.NDArray[Any]]) -> StationCodes:
-        """Code stations by their descriptors as the first tier of :meth:`tiers`."""
+        """Code stations by their descriptors, in the first tier of :meth:`tiers` alone."""
         return cls.tiers(descriptors, 1)[0]
 
     @classmethod
     def tiers(cls, descriptors: Sequence[npt.NDArray[Any]], count: int) -> list[StationCodes]:
         """Code stations by their descriptors (M, R, S), float16 or float32, one array per channel.
 
-        A tier codes the remainder of the tiers before it: the correlations add up.
+        Each tier codes the remainder of the earlier tiers, so that the correlations add up.
 
         Raises:
             ValueError: the channels' shapes differ.
@@ -161,7 +161,7 @@ class StationCodes:
 
     @staticmethod
     def learned_from(stations: int) -> I64:
-        """Return the numbers (K,) of the sample of so many stations, evenly spread."""
+        """Return the numbers (K,) of the sample, evenly spaced, of the given number of stations."""
         return np.arange(0, stations, -(-stations // _SAMPLE) or 1)
 
     @classmethod
@@ -174,7 +174,7 @@ class StationCodes:
             sample: descriptors (K, R, S) of :meth:`learned_from`, one array per channel.
             count: number of tiers.
             stations: number of stations M to be coded.
-            into: arrays (M, 16, 16) for the codes of each tier; None makes them.
+            into: arrays (M, 16, 16) for the codes of each tier; None allocates them.
 
         Raises:
             ValueError: the channels' shapes differ.
@@ -191,12 +191,12 @@ class StationCodes:
 
     @staticmethod
     def shape_of(stations: int) -> tuple[int, int, int]:
-        """Return the shape of the codes of so many stations."""
+        """Return the shape of the codes for a number of stations."""
         return stations, _ROWS, _LANES
 
     @staticmethod
     def encode_tiers(tiers: Sequence[StationCodes], part: slice, descriptors: Sequence[npt.NDArray[Any]]) -> None:
-        """Fill in a part of the codes, by the descriptors (m, R, S) of these stations, one array per channel."""
+        """Fill in part of the codes from the descriptors (m, R, S) of these stations, one array per channel."""
         for start in range(part.start, part.stop, _BATCH):
             batch = slice(start, min(start + _BATCH, part.stop))
             rows = slice(batch.start - part.start, batch.stop - part.start)
@@ -216,7 +216,7 @@ class StationCodes:
         return len(self.codes)
 
     def subset(self, stations: npt.ArrayLike) -> StationCodes:
-        """Return a copy of the codes of stations (K,), in memory; queries of these codes serve it too."""
+        """Copy the codes of stations (K,) into memory; queries of these codes are valid for the copy too."""
         rows = take_rows(self.codes, np.asarray(stations, dtype=np.int64))
         return StationCodes(rows, self.basis, self.step, self.norm, self.sectors)
 
@@ -225,17 +225,17 @@ class StationCodes:
         return {name: value for name, value in self.__dict__.items() if name != "_kernels"}
 
     def query(self, columns: npt.ArrayLike) -> CodedQuery:
-        """Transform a query: its unit columns (D, S), the channels stacked in the stations' order and weighted.
+        """Transform a query's unit columns (D, S), with channels weighted and stacked in the stations' order.
 
         Raises:
-            ValueError: another shape.
+            ValueError: the shape is wrong.
         """
         stacked = as_float32("columns", columns, self.basis.shape[2], self.sectors)
         numbers = _projected(_spectra(stacked[None]), self.basis)[0]
         return CodedQuery(numbers, self.step, self.norm, self.sectors)
 
     def best(self, query: CodedQuery) -> F32:
-        """Return the greatest correlation (M,) with each station over 60 angles; of 60 sectors, all shifts."""
+        """Return the greatest correlation (M,) with each station over 60 angles, which are all shifts of 60 sectors."""
         numbers, turn, unit = query.screen
         best = runtime.dispatch_here(
             self._ready(_BEST),
@@ -272,7 +272,7 @@ class StationCodes:
 
     @cached_property
     def _rotations(self) -> F32:
-        """(64, S) factors of the products at the shifts."""
+        """Factors (64, S) of the products at the shifts."""
         angle = (2.0 * np.pi / self.sectors) * _frequencies()[:, :, None] * np.arange(self.sectors)
         return np.stack([np.cos(angle), -np.sin(angle)], axis=1).reshape(4 * _LANES, -1).astype(np.float32)
 
@@ -285,7 +285,7 @@ class StationCodes:
 
 
 class _Kernels:
-    """The launches, and the memory that they share with NumPy; one call at a time."""
+    """Launches and the memory that they share with NumPy, for one call at a time."""
 
     def __init__(self, codes: I16) -> None:
         self._codes, flat = codes, codes.reshape(-1)
@@ -354,7 +354,7 @@ class _Kernels:
 
 
 class _ByWindow:
-    """Stations (K,) by window; a station of -1 is in none, or in the only one."""
+    """Stations (K,) by window; station -1 is in no window, or in the only one."""
 
     def __init__(self, stations: I32, windows: Windows) -> None:
         self._several = windows.several
@@ -362,7 +362,7 @@ class _ByWindow:
         self._sorted = stations[self._order]
 
     def chunks(self, part: slice) -> Iterator[I64]:
-        """Yield indices of the stations of a window, at most ``_CHUNK`` at a time."""
+        """Yield the indices of a window's stations, at most ``_CHUNK`` at a time."""
         begin, end = 0, len(self._order)
         if self._several:
             begin, end = np.searchsorted(self._sorted, [part.start, part.stop]).tolist()
@@ -371,25 +371,25 @@ class _ByWindow:
 
 
 def _frequencies() -> I64:
-    """(2, 16) frequency of each lane, by group."""
+    """Return the frequency (2, 16) of each lane, by group."""
     return np.stack([_LANE, _LANE + _LANES])
 
 
 @lru_cache(maxsize=4)
 def _turns(sectors: int) -> C64:
-    """(S, 16, 16) factors that turn a query's numbers by each shift."""
+    """Return the factors (S, 16, 16) that turn a query's numbers by each shift."""
     angle = (2.0 * np.pi / sectors) * np.arange(sectors)[:, None, None] * _frequencies()[_GROUP]
     turns: C64 = np.exp(1j * angle).astype(np.complex64)
     return turns
 
 
 def _columns(descriptors: Sequence[npt.NDArray[Any]]) -> F32:
-    """(m, D, S) unit columns of the channels' descriptors (m, R, S)."""
+    """Return the unit columns (m, D, S) of the channels' descriptors (m, R, S)."""
     return np.concatenate([unit_columns(channel) for channel in descriptors], axis=1)
 
 
 def _spectra(columns: F32) -> C64:
-    """(32, m, D) weighted spectra of (m, D, S) columns, such that correlations are plain sums; 0 beyond S / 2."""
+    """Return spectra (32, m, D) of columns (m, D, S), weighted so that correlations are sums; 0 beyond S / 2."""
     sectors = columns.shape[2]
     known = min(_FREQUENCIES, sectors // 2 + 1)
     spectra = np.zeros((_FREQUENCIES, *columns.shape[:2]), dtype=np.complex64)
@@ -401,7 +401,7 @@ def _spectra(columns: F32) -> C64:
 
 
 def _eigenvectors(sample: C64, tiers: int) -> list[C64]:
-    """(16, 16, D) a tier, of the second moments of spectra (32, m, D), greatest first; zeros beyond D."""
+    """Return by tier the eigenvectors (16, 16, D) of spectra's (32, m, D) second moments, greatest first; else 0."""
     moments = np.matmul(sample.transpose(0, 2, 1).astype(np.complex128), sample.conj())
     vectors = np.linalg.eigh(moments)[1][:, :, ::-1]  # (32, D, D)
     found = np.zeros((tiers, _ROWS, _LANES, sample.shape[2]), dtype=np.complex64)
@@ -413,19 +413,19 @@ def _eigenvectors(sample: C64, tiers: int) -> list[C64]:
 
 
 def _steps(sample: C64, basis: C64) -> F32:
-    """(16, 2, 16) value of one unit of int8; larger numbers are clipped."""
+    """Return the values (16, 2, 16) of one unit of int8; numbers beyond its range are clipped."""
     if not sample.shape[1]:
         return np.ones((_ROWS, 2, _LANES), dtype=np.float32)
     parts = _parts(_projected(sample, basis))
     square = (parts * parts).mean(axis=0)
-    least = 1e-3 * square.max(initial=0.0) + 1e-12  # numbers that are empty in the sample
-    # a number that stays near its mean, as a column's sum does, is spread over more of the integers
+    least = 1e-3 * square.max(initial=0.0) + 1e-12  # for numbers that are zero in the sample
+    # a number that stays near its mean, such as a column's sum, uses more of the integers
     reach = np.minimum(_INT8_RANGE * np.sqrt(square), _MARGIN * np.abs(parts).max(axis=0))
     return np.asarray(np.maximum(reach, np.sqrt(least)) * (1.0 / 127.0), dtype=np.float32)
 
 
 def _projected(spectra: C64, basis: C64) -> C64:
-    """(m, 16, 16) numbers of spectra (32, m, D)."""
+    """Return the numbers (m, 16, 16) of spectra (32, m, D)."""
     numbers = np.empty((spectra.shape[1], _ROWS, _LANES), dtype=np.complex64)
     for group, rows in enumerate((slice(0, _LOW), slice(_LOW, _ROWS))):
         lanes = spectra[_frequencies()[group]]  # (16, m, D)
@@ -434,12 +434,12 @@ def _projected(spectra: C64, basis: C64) -> C64:
 
 
 def _parts(numbers: C64) -> F32:
-    """(m, 16, 2, 16) real and imaginary parts."""
+    """Return the real and imaginary parts (m, 16, 2, 16)."""
     return np.stack([numbers.real, numbers.imag], axis=2)
 
 
 def _pack(numbers: F32) -> I16:
-    """(..., L) int16 of (..., 2, L): the second in the upper byte, rounded with the lower one in mind."""
+    """Pack (..., 2, L) to int16 (..., L); the second is in the upper byte, rounded to allow for the lower byte."""
     low = np.clip(np.rint(numbers[..., 0, :]), -127, 127).astype(np.int16) & 255
     high = np.clip(np.rint(numbers[..., 1, :] - low * np.float32(1.0 / 256.0)), -127, 127).astype(np.int16)
     packed: I16 = (high << 8) | low
@@ -447,7 +447,7 @@ def _pack(numbers: F32) -> I16:
 
 
 def _unpack(pair: I16) -> F32:
-    """(..., 2, L) numbers of (..., L) int16: the lower byte, and the whole number in units of 256."""
+    """Unpack int16 (..., L) to numbers (..., 2, L): the lower byte, and the whole number in units of 256."""
     whole = np.empty((*pair.shape[:-1], 2, pair.shape[-1]), dtype=np.float32)
     whole[..., 0, :] = pair.astype(np.int8)
     np.multiply(pair, np.float32(1.0 / 256.0), out=whole[..., 1, :])

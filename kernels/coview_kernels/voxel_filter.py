@@ -1,7 +1,7 @@
 """Voxel filter: rigid transform, range filter and first point of each voxel, in one pass over a cloud.
 
-The pass runs on one thread: a frame takes 0.7 ms, of which waking another thread would cost 0.1 ms, and voxels that
-both threads have met would have to be merged afterwards.
+The pass runs on one thread. A frame takes 0.7 ms; waking another thread would cost 0.1 ms, and voxels that both threads
+found would have to be merged.
 """
 
 from __future__ import annotations
@@ -16,13 +16,13 @@ from coview_kernels.arrays import F32, F64, as_finite64, as_float32
 from coview_kernels.launch import Launch
 from coview_kernels.warm_up import SAMPLE, compiled_by
 
-_MAX_KEPT_BYTES = 1 << 23  # of table and results that stay from call to call
+_MAX_KEPT_BYTES = 1 << 23  # of table and results that are kept between calls
 _MAX_SENSOR = 1 << 29  # voxels between the sensor and the origin
 _MAX_COORDINATE = 1 << 30  # voxels from the origin
 _MAX_FLOAT32 = float(np.finfo(np.float32).max)
-_NO_LIMIT = 1e300  # stands for infinity: a compiler may assume that there is none
-_MAX_CALLS = 1 << 21  # numbers of calls that fit into a key of the table beside its cube
-_MIN_BITS = 10  # of the hash table; doubled until no cloud fills more than half of it
+_NO_LIMIT = 1e300  # replaces infinity, which a compiler may assume does not exist
+_MAX_CALLS = 1 << 21  # call numbers that fit into a key of the table beside its cube
+_MIN_BITS = 10  # of the hash table, whose size doubles until no cloud fills more than half of it
 _MIN_ROWS = 4096  # of the results; doubled as needed
 _BLOCK = 64  # points that the kernel takes at once
 _EMPTY: F32 = np.empty(0, dtype=np.float32)
@@ -40,18 +40,17 @@ def transform_unique(
     """Move a cloud into another frame and keep the first point of each voxel there.
 
     Args:
-        points: (N, 3) source-frame coordinates, metres, float32, near the origin of their frame: float32 has 7
-            digits.
-        T: (4, 4) ``T_target_source``; the product is formed in float64 and rounded to float32 once.
-        voxel: edge of the voxels in the target frame, metres; a point lies in voxel ``floor(p * (1 /
-            voxel))``. Zero or negative: keep every point.
+        points: (N, 3) float32 source-frame coordinates, metres, near their origin, as float32 has 7 digits.
+        T: (4, 4) ``T_target_source``; the product is computed in float64 and rounded to float32 once.
+        voxel: edge of the voxels in the target frame, metres; a point is in voxel ``floor(p * (1 / voxel))``. Zero or
+            negative: keep every point.
         r_min: least range in the source frame that is kept, metres (inclusive).
-        r_max: range in the source frame from which on points are dropped, metres (exclusive).
-        centre: (3,) source-frame point that ranges are measured from.
+        r_max: range in the source frame from which points are dropped, metres (exclusive).
+        centre: (3,) origin of the ranges, source frame.
 
     Returns:
-        (K, 3) float32 target-frame coordinates, in input order, and the number of rows dropped because they,
-        or their images, are NaN or infinite.
+        (K, 3) float32 target-frame coordinates, in input order, and the number of rows dropped because they, or their
+        images, are NaN or infinite.
 
     Raises:
         ValueError: an array has the wrong shape, ``T`` or ``centre`` is not finite, or a range is negative or NaN.
@@ -68,7 +67,7 @@ def transform_unique(
     )  # fmt: skip
 
 
-_pass: _KernelPass | None = None  # one is enough: only one call of native code runs at a time
+_pass: _KernelPass | None = None  # one for all calls, as only one call of native code runs at a time
 
 
 def _transform_unique(
@@ -88,8 +87,8 @@ def _transform_unique(
 class _KernelPass:
     """One pass of the kernel over a cloud, with its hash table and results; for native code only.
 
-    Both stay from call to call and double when they are full. The table is never cleared: entries carry the number of
-    their call.
+    Both are kept between calls, and double when they are full. The table is never cleared, as entries carry the number
+    of their call.
     """
 
     def __init__(self) -> None:
@@ -105,7 +104,7 @@ class _KernelPass:
     ) -> tuple[F32, int] | None:
         """Return the points kept, in a buffer that the next call overwrites, and the number of rows not finite.
 
-        None if the cloud is out of reach, farther than 2^15 voxels from the sensor or 2^29 from the origin.
+        None if the cloud is out of reach: farther than 2^15 voxels from the sensor, or 2^29 from the origin.
         """
         inverse = 1.0 / voxel if voxel > 0 else 0.0
         sensor = T[:3, 3] * inverse

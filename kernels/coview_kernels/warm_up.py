@@ -4,7 +4,7 @@ A module of kernels registers a call for each public function::
 
     compiled_by("nearest", lambda: nearest(PointGrid(SAMPLE), SAMPLE, 1.0))
 
-and a caller that must not wait later calls ``warm_up("nearest")`` first.
+and a caller that must not wait later first calls ``warm_up("nearest")``.
 """
 
 from __future__ import annotations
@@ -22,10 +22,10 @@ import numpy as np
 from coview_kernels import runtime
 
 SAMPLE = np.ones((2, 3), dtype=np.float32)
-"""A cloud for the calls of :func:`compiled_by`; not to be written to."""
+"""A read-only cloud for the calls of :func:`compiled_by`."""
 
-_PATIENCE = 600.0  # seconds to wait for it; on an idle computer it takes five, on the smallest boards some minutes
-_INTERVAL = 1.0  # seconds between two looks at another process that compiles
+_PATIENCE = 600.0  # seconds to wait; compiling takes five on an idle computer, some minutes on the smallest boards
+_INTERVAL = 1.0  # seconds between checks of another process that compiles
 
 _calls: dict[str, Callable[[], object]] = {}
 
@@ -36,7 +36,7 @@ def compiled_by(name: str, call: Callable[[], object]) -> None:
 
 
 def warm_up(*names: str) -> None:
-    """Start the backend and compile the kernels of public functions, by default of all; ValueError for other names."""
+    """Start the backend and compile the kernels of public functions, by default all; ValueError for unknown names."""
     if unknown := sorted(set(names) - set(_calls)):
         raise ValueError(f"no kernel {', '.join(unknown)}; there are {', '.join(sorted(_calls))}")
     if runtime.backend() == "numpy":
@@ -46,11 +46,11 @@ def warm_up(*names: str) -> None:
 
 
 def compile_once(*names: str, say: Callable[[str], None] = lambda text: None) -> None:
-    """Have the kernels of public functions compiled and stored by another process, the first time on a machine.
+    """Compile and store the kernels of public functions in another process, the first time on a machine.
 
-    The library stores them only when a process exits by itself: one that will be killed calls this before its first
-    kernel, and would compile them at every start. The other process goes on if this one is killed meanwhile. ``say``
-    is called with each step. Does nothing where compiled kernels cannot be kept.
+    The library stores kernels only when a process exits by itself. A process that will be killed calls this before its
+    first kernel, or it would compile them at every start. The other process continues if this one is killed. ``say`` is
+    called with each step. Does nothing if compiled kernels cannot be kept.
     """
     mark = runtime.mark_of(names)
     if mark is None or mark.is_file():
@@ -58,18 +58,18 @@ def compile_once(*names: str, say: Callable[[str], None] = lambda text: None) ->
     code = "import sys; from coview_kernels.warm_up import _store; _store(*sys.argv[1:])"
     command = [sys.executable, "-P", "-c", code, str(mark), *names]
     with contextlib.suppress(OSError):
-        quiet = subprocess.DEVNULL  # it may outlive us, and would keep our output open
+        quiet = subprocess.DEVNULL  # a process that outlives us must not keep our output open
         with subprocess.Popen(command, stdin=quiet, stdout=subprocess.PIPE, stderr=quiet, text=True) as helper:
             for line in helper.stdout or ():
                 say(line.strip())
 
 
 def _store(mark: str, *names: str) -> None:
-    """Compile and store kernels unless the file ``mark`` says that they are, and print each step."""
+    """Compile and store kernels unless the file ``mark`` marks them as stored, and print each step."""
     done = Path(mark)
-    with done.with_name("coview.lock").open("w") as lock:  # two that store at once would get in each other's way
+    with done.with_name("coview.lock").open("w") as lock:  # one process at a time
         _wait_for(lock)
-        if done.is_file():  # another process has, meanwhile
+        if done.is_file():  # another process has stored them
             return
         for number, name in enumerate(names, 1):
             _tell(f"compiling kernels for this machine, once: {number} of {len(names)}")
@@ -79,9 +79,9 @@ def _store(mark: str, *names: str) -> None:
 
 
 def _wait_for(lock: TextIO) -> None:
-    """Wait until no other process holds the lock, where the system has locks, and take it."""
+    """Wait for the lock and take it, on systems with locks."""
     end = time.monotonic() + _PATIENCE
-    with contextlib.suppress(ImportError, OSError):  # the latter: a file system without locks
+    with contextlib.suppress(ImportError, OSError):  # OSError: a file system without locks
         import fcntl
 
         while time.monotonic() < end:
@@ -95,6 +95,6 @@ def _wait_for(lock: TextIO) -> None:
 
 
 def _tell(text: str) -> None:
-    with contextlib.suppress(OSError):  # the process that we tell may have been killed
+    with contextlib.suppress(OSError):  # the reader may have been killed
         sys.stdout.write(f"{text}\n")
         sys.stdout.flush()

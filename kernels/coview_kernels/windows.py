@@ -1,7 +1,7 @@
 """Products of small images with windows of a raster: a correlation at given places.
 
-Cells hold eight signed bytes, whose products are summed apart: one of them may be the weight of a mean of the others.
-A window of 33 x 33 cells takes a microsecond; for all places at once a Fourier transform is faster.
+Cells hold eight signed bytes, whose products are summed separately, as one of them may be the weight in a mean of the
+others. A window of 33 x 33 cells takes a microsecond; for all places at once a Fourier transform is faster.
 """
 
 from __future__ import annotations
@@ -18,18 +18,18 @@ DIMENSIONS = 8
 """Numbers in a cell."""
 
 _LANES = 32  # as in _ti_windows.py
-_MAX_CELLS = (2**31 - 1) // (128 * 128)  # whose sum of products an int32 holds
+_MAX_CELLS = (2**31 - 1) // (128 * 128)  # so that an int32 holds the sum of products
 
 
 class WindowImages:
-    """K images (K, h, h, 8) of signed bytes, prepared to be compared with windows of a raster.
+    """K images (K, h, h, 8) of signed bytes, prepared for comparison with windows of a raster.
 
     Attributes:
-        padded: (K, h, stride) int8, rows in whole registers.
-        spans: (h, 2) int32 the first register of each row that any image uses, and the one behind the last.
+        padded: (K, h, stride) int8, rows of whole registers.
+        spans: (h, 2) int32 first register of each row that any image uses, and the register after the last.
 
     Raises:
-        ValueError: another shape or type.
+        ValueError: the shape or type is wrong.
     """
 
     def __init__(self, images: I8) -> None:
@@ -57,7 +57,7 @@ class WindowImages:
 
     @property
     def images(self) -> I8:
-        """(K, h, h, 8) without the padding of the registers."""
+        """Images (K, h, h, 8) without the padding of the registers."""
         return self.padded[..., : self.side * DIMENSIONS].reshape(len(self), self.side, self.side, DIMENSIONS)
 
 
@@ -65,11 +65,11 @@ class WindowRaster:
     """A raster (H, W, 8) of signed bytes, prepared for windows that reach up to ``margin`` cells beyond it.
 
     Attributes:
-        flat: int8, the raster with a margin of zeros, row by row, and zeros behind it.
+        flat: int8, the raster with a margin of zeros, row by row, followed by zeros.
         margin: cells.
 
     Raises:
-        ValueError: another shape or type, or more than 2 GB.
+        ValueError: the shape or type is wrong, or the raster has more than 2 GB.
     """
 
     def __init__(self, raster: I8, margin: int) -> None:
@@ -86,18 +86,18 @@ class WindowRaster:
 
     @property
     def padded(self) -> I8:
-        """(H + 2 margin, W + 2 margin, 8) with its margin."""
+        """Raster (H + 2 margin, W + 2 margin, 8) with its margin."""
         height, width = self._shape
         return self.flat[:-_LANES].reshape(height, width, DIMENSIONS)
 
 
 def window_products(raster: WindowRaster, images: WindowImages, corners: npt.ArrayLike, which: npt.ArrayLike) -> I32:
-    """Sum the products of images with windows of a raster, each of the eight dimensions by itself.
+    """Sum the products of images with windows of a raster, separately for each of the eight dimensions.
 
     Args:
         raster: the raster.
         images: K images.
-        corners: (N, 2) row and column of a window's first cell in the raster; in its margin or inside.
+        corners: (N, 2) row and column of a window's first cell in the raster or its margin.
         which: (N,) image of each window.
 
     Returns:
@@ -125,7 +125,7 @@ def window_products(raster: WindowRaster, images: WindowImages, corners: npt.Arr
 
 _BYTES, _WHOLES = np.zeros(1, dtype=np.int8), np.zeros(1, dtype=np.int32)
 _launch = Launch("windows", "products", _BYTES, 0, _BYTES, 0, _WHOLES, _WHOLES, _WHOLES, _WHOLES)
-"""One is enough: only one call of native code runs at a time."""
+"""One launch for all calls, as only one call of native code runs at a time."""
 
 
 def _native(raster: WindowRaster, images: WindowImages, at: I32, which: I32) -> I32:

@@ -1,7 +1,7 @@
 """NumPy twins of the kernels, with the same names and signatures.
 
-They are the oracle of the tests, and the implementation where Taichi has no wheel or ``COVIEW_KERNELS=numpy`` is set.
-They trust their arguments: the public functions of :mod:`coview_kernels` check them.
+They are the oracle of the tests, and the implementation if Taichi has no wheel or ``COVIEW_KERNELS=numpy`` is set.
+The public functions of :mod:`coview_kernels` check the arguments.
 """
 
 from __future__ import annotations

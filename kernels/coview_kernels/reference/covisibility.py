@@ -6,14 +6,14 @@ import numpy as np
 
 from coview_kernels.arrays import F32, I32, Mask
 
-_MIN_SLOPE = -np.finfo(np.float64).max  # of a height of minus infinity: above the slopes of empty bins
+_MIN_SLOPE = -np.finfo(np.float64).max  # slope of a height of minus infinity, above the slopes of empty bins
 
 
 def visible(max_height: F32, count: I32, ties: bool = False) -> Mask:
     """Return the horizontally visible bins (..., R, S) of eq. 2, with ``ties`` also those on the line of sight."""
     occupied: Mask = count > 0
-    # Slopes are quotients of a float32 and a small integer, rounded once: equal ones stay equal, and distinct ones
-    # distinct. So a tie is a tie on every machine.
+    # Slopes are quotients of a float32 and a small integer, rounded once, so equal slopes stay equal and different
+    # slopes stay different: a tie is a tie on every machine.
     distance = np.arange(1.0, occupied.shape[-2] + 1)[:, None]
     with np.errstate(invalid="ignore"):  # an empty bin may hold anything
         slope = np.where(occupied, np.maximum(max_height.astype(np.float64) / distance, _MIN_SLOPE), -np.inf)
@@ -24,7 +24,7 @@ def visible(max_height: F32, count: I32, ties: bool = False) -> Mask:
 
 
 def dense(count: I32) -> Mask:
-    """Return the vertically visible bins (..., R, S) of eq. 3: at least as many points as the bins' mean."""
+    """Return the vertically visible bins (..., R, S) of eq. 3, with at least the bins' mean number of points."""
     points = np.maximum(count, 0).astype(np.int64)
     bins = count.shape[-2] * count.shape[-1]
     enough: Mask = (points > 0) & (points * bins >= points.sum(axis=(-2, -1), keepdims=True))

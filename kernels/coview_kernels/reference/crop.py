@@ -11,7 +11,7 @@ from coview_kernels.cells import Cells, cell_numbers, grid_frame
 
 
 class Cut(NamedTuple):
-    """The circle to cut out of a map, metres; its edge is outside."""
+    """Circle to cut out of a map, metres; excludes its edge."""
 
     x: float
     y: float
@@ -24,9 +24,9 @@ class Crop(NamedTuple):
     points: F32
     """(K, 3) metres, by cell; a view of ``cells.rows``, not contiguous."""
     normals: F32
-    """(K, 3), as long as the planarity around each point."""
+    """(K, 3) unit normals times the planarity around each point."""
     cells: Cells
-    """Of these points, in their order."""
+    """Cells of these points, in their order."""
 
 
 def crop_points(points: F32, normals: I8, spans: I32, cut: Cut) -> Crop | None:

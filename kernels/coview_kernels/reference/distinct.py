@@ -8,13 +8,13 @@ from coview_kernels.arrays import F32, I64
 
 
 def distinct_poses(poses: F32, count: int, square: float, cosine: float) -> I64:
-    """Choose the first ``count`` of (N, 5) poses that differ from all chosen before: (K,) indices.
+    """Choose the first poses that differ from all earlier choices; return their indices (K,).
 
     Args:
         poses: (N, 5) float32 position, and cosine and sine of the heading.
-        count: how many, at most.
-        square: of the distance below which two positions are one.
-        cosine: of the turn below which two headings are one.
+        count: greatest number of choices.
+        square: square of the distance below which two positions are equal.
+        cosine: cosine of the turn below which two headings are equal.
     """
     free = np.ones(len(poses), dtype=bool)
     chosen: list[int] = []

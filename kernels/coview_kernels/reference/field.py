@@ -1,4 +1,4 @@
-"""Scores of hypotheses against a likelihood field, in NumPy: a hypothesis after another, a pose after another."""
+"""Scores of hypotheses against a likelihood field, in NumPy, hypothesis by hypothesis and pose by pose."""
 
 from __future__ import annotations
 
@@ -10,37 +10,37 @@ from coview_kernels.arrays import F32, F64, I32, I64, U16, Mask
 
 CELL, TILE = 0.5, 32
 NO_GROUND, NOT_SURVEYED = -32768, -32767
-"""Values of the ground's raster that stand for no height."""
+"""Values of the ground raster without a height."""
 
 REACH, TURNS, TURN = 3, 7, 0.0349066
-"""Metres of a coarse shift to either side, headings of the coarse level, and radians between these."""
+"""Largest coarse shift, metres; number of coarse headings, and radians between them."""
 
 NEAR_STEP, NEAR_TURN = 0.25, 0.00872665
-"""Metres and radians of the first fine level where there is no coarse one; the next are half of it each."""
+"""Metres and radians of the first fine level without a coarse level; each further level halves them."""
 
 ON_GROUND, UNDER_EDGE, UPPER_FLOOR, EDGE_STEP = 0.15, 0.5, 1.5, 0.25
-"""Metres: off the ground that still are on it; above a roof edge that still are below it; above the lowest surface from
-which on the bits alone tell a floor; a unit of the stored edges."""
+"""Metres: tolerance of points on the ground; tolerance of points below a roof edge; height above the lowest surface
+from which only the bits decide on a floor; unit of the stored edges."""
 
 
 class FieldLayers(NamedTuple):
-    """Rasters of a map as they are looked up; tile 0 is empty and stands for what has not been surveyed."""
+    """Rasters of a map for the look-ups; tile 0 is empty and represents unsurveyed tiles."""
 
     table: I32
     """(R, C) number of each tile; 0 for none, as along the table's border."""
     base: F32
-    """(T + 1,) height that a tile's heights count from, metres."""
+    """(T + 1,) base of a tile's heights, metres."""
     bits: I64
-    """(T + 1, 32, 32, 2) bit ``floor(2 z) mod 64``: near structure; on it."""
+    """(T + 1, 32, 32, 2) bit ``floor(2 z) mod 64``: near structure; on structure."""
     surface: I32
     """(T + 1, 32, 32) ground in the lower half, centimetres; edge above it."""
     coarse: U16
-    """(32, 2 C + 1, 16 R) a plane for each metre of height modulo 32, a word for every eight cells of a metre along a
-    row: bit k says whether the k-th cell from there on, of 16, is within a metre of structure."""
+    """(32, 2 C + 1, 16 R) a plane for each metre of height modulo 32, a word for every eight one-metre cells along a
+    row: bit k says whether the k-th of the 16 cells from there on is within a metre of structure."""
 
 
 class Plan(NamedTuple):
-    """A scan, the parts of it that the levels take, the number of fine levels, and whether a coarse one comes first."""
+    """A scan, its parts for the levels, the number of fine levels, and whether a coarse level comes first."""
 
     structure: F32
     low: F32
@@ -53,7 +53,7 @@ class Plan(NamedTuple):
 
 
 def field_scores(layers: FieldLayers, plan: Plan, start: F64) -> tuple[F64, I32]:
-    """Score hypotheses (H, 4), metres from the table's corner: twin of :func:`coview_kernels.field_scores`.
+    """Score hypotheses (H, 4), metres from the table's corner; twin of :func:`coview_kernels.field_scores`.
 
     Returns:
         Poses (H, 4), and counts (H, 7) in the order of :class:`coview_kernels.FieldScores`.
@@ -122,7 +122,7 @@ def _coarse_hits(planes: U16, structure: F32, pose: F64, yaw: float) -> I64:
 
 
 def _cells(layers: FieldLayers, points: F32) -> tuple[I64, I64, I64]:
-    """Tile, row and column (N,) of the cells that hold the points."""
+    """Return tile, row and column (N,) of the cells that hold the points."""
     low = np.zeros(2, dtype=np.int64)
     limit = np.array(layers.table.shape) * TILE - 1
     cell = np.clip(np.floor(points[:, 1::-1] / np.float32(CELL)).astype(np.int64), low, limit)
@@ -137,20 +137,20 @@ def _bit(words: I64, z: F32) -> Mask:
 
 
 def _heights(layers: FieldLayers, cell: tuple[I64, I64, I64]) -> tuple[F32, Mask, Mask]:
-    """Height of the ground, whether there is one, and whether the cell has been surveyed."""
+    """Return the ground height, whether there is one, and whether the cell has been surveyed."""
     stored = layers.surface[cell].astype(np.int16).astype(np.int32)
     height = layers.base[cell[0]] + np.float32(0.01) * stored.astype(np.float32)
     return height, stored > NOT_SURVEYED, stored != NOT_SURVEYED
 
 
 def ground_heights(layers: FieldLayers, points: F32) -> F32:
-    """Height (N,) of the ground in the cells of points (N, 3); NaN where there is none."""
+    """Return the ground height (N,) in the cells of points (N, 3); NaN without ground."""
     height, has, _ = _heights(layers, _cells(layers, points))
     return np.where(has, height, np.float32(np.nan))
 
 
 def _rise(layers: FieldLayers, low: F32, pose: F64, reach: float) -> float:
-    """Metres by which the scan has to rise for its ground to lie on the map's, from points within ``reach`` of it."""
+    """Return the metres that the scan has to rise to the map's ground, from points within ``reach`` of it."""
     placed = _placed(low, pose)
     height, has, _ = _heights(layers, _cells(layers, placed))
     off = height - placed[:, 2]
@@ -165,7 +165,7 @@ def _fine_hits(layers: FieldLayers, structure: F32, pose: F64) -> int:
 
 
 def structure_at(layers: FieldLayers, structure: F32, pose: F64) -> tuple[Mask, Mask, Mask, Mask]:
-    """Tell which structure points (N, 3) at a pose (4,) lie where the map is surveyed; near, covered by, on its own."""
+    """Mask structure points (N, 3) at a pose (4,) that are surveyed, near map structure, covered by it, and on it."""
     placed = _placed(structure, pose)
     cell = _cells(layers, placed)
     _, _, surveyed = _heights(layers, cell)
@@ -177,7 +177,7 @@ def structure_at(layers: FieldLayers, structure: F32, pose: F64) -> tuple[Mask, 
 
 
 def near_shifted(layers: FieldLayers, structure: F32, pose: F64, offsets: I64) -> Mask:
-    """Mask (H, N) structure points (N, 3) at a pose (4,) near map structure, moved by (H, 2) rows and columns."""
+    """Mask (H, N) structure points (N, 3), at a pose (4,) moved by (H, 2) rows and columns, near map structure."""
     if not len(structure) or not len(offsets):
         return np.zeros((len(offsets), len(structure)), dtype=bool)
     placed = _placed(structure, pose)

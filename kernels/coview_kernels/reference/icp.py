@@ -1,4 +1,4 @@
-"""Trimmed point-to-plane ICP in plain NumPy, on SciPy's k-d tree; point-to-point where the map has no surface."""
+"""Trimmed point-to-plane ICP in plain NumPy, with SciPy's k-d tree; point-to-point where the map has no surface."""
 
 from __future__ import annotations
 
@@ -13,27 +13,27 @@ if TYPE_CHECKING:
     from scipy.spatial import cKDTree
 
 SCATTER = 2.0
-"""Times the width of the weights, how far points lie about one another where they form no surface; set by hand."""
+"""Distance between points that form no surface, in widths of the weights; set by hand."""
 
 _MAX_SHARE = 5.0  # a handful of points must not outweigh thousands
-_FIRST_BIN, _BINS = 107 << 6, 2048  # of squared distances: 64 to an octave, from 2^-20 square metres up
+_FIRST_BIN, _BINS = 107 << 6, 2048  # of squared distances: 64 per octave, from 2^-20 square metres up
 
 
 class Scale(NamedTuple):
-    """One of the stages of a registration."""
+    """One scale of a registration."""
 
     radius: float
-    """Farthest partner (exclusive), metres."""
+    """Largest distance to a partner (exclusive), metres."""
     width: float
-    """Of the Cauchy weights, metres."""
+    """Width of the Cauchy weights, metres."""
     shift: float = 1e-3
     """The scale ends with a step that is shorter than this, metres, ..."""
     turn: float = 5e-5
     """... and turns by less than this, radians."""
     every: int = 1
-    """Of either kind of point one of so many takes part."""
+    """Every n-th point of each kind is used."""
     keep: float = 1.0
-    """Of either kind of pair this share is kept, in (0, 1]: the nearest."""
+    """Share of the pairs of each kind that is kept, the nearest, in (0, 1]."""
 
 
 class Plan(NamedTuple):
@@ -48,18 +48,18 @@ class Plan(NamedTuple):
 
 
 class Registration(NamedTuple):
-    """Registered pose, its information, and how the points fit there."""
+    """Registered pose, its information matrix, and the fit of the points."""
 
     T_map_source: F64
     """(4, 4)."""
     information: F64
-    """(6, 6) over (rx, ry, rz, x, y, z) about the moved pivot before the last step, the prior included."""
+    """(6, 6) over (rx, ry, rz, x, y, z) about the moved pivot before the last step, including the prior."""
     rmse: float
     """Weighted root mean square of the kept residuals before the last step, metres."""
     pairs: int
-    """How many pairs were kept at the last step."""
+    """Number of pairs kept at the last step."""
     iterations: int
-    """Over all scales."""
+    """Total over all scales."""
     converged: bool
     """Whether the last step was small enough to stop."""
 
@@ -89,7 +89,7 @@ def align_planes(tree: cKDTree, normals: F32, source: F32, kind: Mask, plan: Pla
 def _step(
     tree: cKDTree, normals: F32, source: F32, kind: Mask, plan: Plan, T: F64, scale: Scale
 ) -> tuple[F64, F64, float, int] | None:
-    """One Gauss-Newton step: increment (6,), information (6, 6), rmse and number of pairs."""
+    """Take one Gauss-Newton step: increment (6,), information (6, 6), rmse and number of pairs."""
     distance, partner = nearest(tree, source, scale.radius, T)
     found = np.flatnonzero(np.isfinite(distance))
     pairs = partner[found]
@@ -114,10 +114,10 @@ def _step(
 
 
 def _normal_equations(arm: F64, gap: F64, normals: F32, share: F64, width: float) -> tuple[F64, F64, float]:
-    """H (6, 6) = sum w J^T J, b (6,) = sum w J^T r, and the mean square of r, for points at ``arm`` of the pivot.
+    """Return H (6, 6) = sum w J^T J, b (6,) = sum w J^T r, and the mean of r^2, for points at ``arm`` from the pivot.
 
-    Along its partner's normal a pair has J = (arm x n, n), r = n . gap and w = p share / (1 + (r / width)^2), where p
-    is the planarity, the length of the partner's normal as given. The rest, 1 - p, tells of all three directions:
+    Along its partner's normal a pair has J = (arm x n, n), r = n . gap and w = p share / (1 + (r / width)^2), where the
+    planarity p is the length of the partner's given normal. The rest, 1 - p, constrains all three directions:
     J = (arm x e, e) and r = e . gap for each axis e, with w = (1 - p) share / (4 + (|gap| / width)^2).
     """
     planarity = np.minimum(np.linalg.norm(normals.astype(np.float64), axis=1), 1.0)
@@ -140,7 +140,7 @@ def _normal_equations(arm: F64, gap: F64, normals: F32, share: F64, width: float
 
 
 def _shares(squares: F32, kind: Mask, keep: float, points: int) -> F64:
-    """Weights (M,) of pairs by their squared distances: 0 for those trimmed, and equal sums for both kinds."""
+    """Return weights (M,) of pairs by their squared distances, 0 for trimmed pairs, with equal sums for both kinds."""
     share = np.zeros(len(squares))
     bins = np.clip((squares.view(np.int32) >> 17) - _FIRST_BIN, 0, _BINS - 1)
     for group in (kind, ~kind):

@@ -1,4 +1,4 @@
-"""Twins of the kernels that draw clouds from above."""
+"""Twins of the kernels of clouds seen from above."""
 
 from __future__ import annotations
 
@@ -54,7 +54,7 @@ def height_columns(
 
 
 def _interpolated(values: F32, local: F32, scale: np.float32) -> F32:
-    """Interpolate an image (h, w) bilinearly at points (N, 3); beyond its cells' middles as at the nearest."""
+    """Interpolate an image (h, w) bilinearly at points (N, 3), constant beyond the outer cells' centres."""
     rows, columns = values.shape
     at = (local[:, :2] * scale - np.float32(0.5)).astype(np.float64)
     x, y = np.clip(at[:, 0], 0, columns - 1), np.clip(at[:, 1], 0, rows - 1)

@@ -1,14 +1,14 @@
-"""Polar binning of points and of raster cells in plain NumPy, with ring and sector decided as in every kernel.
+"""Polar binning of points and of raster cells in plain NumPy, with the same rings and sectors as every kernel.
 
-An offset (dx, dy) is rounded to float32: its products are exact in float64. Both decisions compare exact numbers with a
-table, and neither fused multiply-add nor a vectorised sine can move a point across an edge:
+An offset (dx, dy) is rounded to float32, so that its products are exact in float64. Both decisions compare exact
+numbers with a table, so neither fused multiply-add nor a vectorised sine can move a point across an edge:
 
 * ring k holds ``edge2[k] <= dx*dx + dy*dy < edge2[k + 1]``;
 * sector k lies counter-clockwise of, or on, the ray ``edges[k]`` and clockwise of ``edges[k + 1]``; the rays are
   float32 directions, 6e-8 rad from 2 pi k / S at worst and exact on the axes.
 
-A point on a ring edge belongs to the outer ring, on a sector edge to the sector counter-clockwise of it, at the centre
-to ring 0, sector 0. Offsets below 1e-37 m may count as zero: Taichi's threads flush subnormal numbers.
+A point on a ring edge belongs to the outer ring, a point on a sector edge to the sector counter-clockwise of it, the
+centre to ring 0, sector 0. Offsets below 1e-37 m may count as zero, as Taichi's threads flush subnormal numbers.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ from coview_kernels.arrays import F32, F64, I32, I64, PolarGrid
 
 @lru_cache(maxsize=64)
 def ring_edges2(rings: int, r_max: float) -> F64:
-    """(R + 1,) squared ring edges, metres squared; read-only."""
+    """Return the squared ring edges (R + 1,), square metres; read-only."""
     edges: F64 = np.square(np.linspace(0.0, r_max, rings + 1, dtype=np.float64))
     edges.flags.writeable = False
     return edges
@@ -31,10 +31,10 @@ def ring_edges2(rings: int, r_max: float) -> F64:
 
 @lru_cache(maxsize=64)
 def sector_edges(sectors: int) -> F64:
-    """(S + 1, 2) directions of the sector edges, float32 values held in float64; read-only."""
+    """Return the directions (S + 1, 2) of the sector edges, float32 values in float64; read-only."""
     angle = np.arange(sectors + 1) * (2.0 * np.pi / sectors)
     rays = np.stack([np.cos(angle), np.sin(angle)], axis=1)
-    rays[np.abs(rays) < 1e-12] = 0.0  # the axes must be exact: points of raster maps lie on them
+    rays[np.abs(rays) < 1e-12] = 0.0  # the axes must be exact, as points of raster maps lie on them
     rays[-1] = rays[0]
     edges = rays.astype(np.float32).astype(np.float64)
     edges.flags.writeable = False
@@ -42,13 +42,13 @@ def sector_edges(sectors: int) -> F64:
 
 
 def polar_index(dx: F32, dy: F32, rings: int, sectors: int, r_max: float) -> I64:
-    """Flat bin ``ring * S + sector`` of (N,) offsets in metres, -1 at and beyond ``r_max``."""
-    x, y = dx.astype(np.float64) + 0.0, dy.astype(np.float64) + 0.0  # -0 + 0 is 0: arctan2 tells them apart
+    """Return the flat bin ``ring * S + sector`` of offsets (N,) in metres, -1 at and beyond ``r_max``."""
+    x, y = dx.astype(np.float64) + 0.0, dy.astype(np.float64) + 0.0  # turns -0 into 0, which arctan2 distinguishes
     r2 = x * x + y * y
     edge2 = ring_edges2(rings, r_max)
     inside = r2 < edge2[-1]
     ring = np.minimum(np.sqrt(np.where(inside, r2, 0.0)) * (rings / r_max), rings - 1).astype(np.int64)
-    # the guesses are right to 1e-15 or so: only the edge next to them can be on the wrong side
+    # the guesses are accurate to about 1e-15: only the edge next to them can be on the wrong side
     ring += (r2 >= edge2[ring + 1]).astype(np.int64) - (r2 < edge2[ring])
 
     theta = np.arctan2(y, x)
@@ -83,7 +83,7 @@ def polar_bin(points: F32, centre: F64, rings: int, sectors: int, r_max: float) 
 
 
 def cell_table(cell: float, rings: int, sectors: int, r_max: float) -> tuple[I64, I64, I64]:
-    """Row offset, column offset and flat bin of every raster cell within ``r_max``, sorted by bin."""
+    """Return row offset, column offset and flat bin of every raster cell within ``r_max``, sorted by bin."""
     reach = math.ceil(r_max / cell)
     steps = np.arange(-reach, reach + 1)
     rows, cols = (a.ravel() for a in np.meshgrid(steps, steps, indexing="ij"))
@@ -102,7 +102,7 @@ def station_bins(
     d_row, d_col, bins = cell_table(cell, rings, sectors, r_max)
     occupied_bins, starts = np.unique(bins, return_index=True)
     reach = math.ceil(r_max / cell)
-    # a border as wide as the radius makes every neighbour a plain offset, without bounds checks
+    # with a border as wide as the radius every neighbour is a plain offset, without bounds checks
     empty = raster_count <= 0
     count_pad = np.pad(np.where(empty, 0, raster_count), reach).ravel()
     max_pad = np.pad(np.where(empty, -np.inf, raster_max), reach, constant_values=-np.inf).ravel()

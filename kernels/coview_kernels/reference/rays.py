@@ -1,4 +1,4 @@
-"""First hits of rays on triangles, by NumPy: all rays of a block go down the tree together."""
+"""First hits of rays on triangles in NumPy; all rays of a block descend the tree together."""
 
 from __future__ import annotations
 
@@ -11,10 +11,10 @@ from coview_kernels.arrays import F32, F64, I64, Mask
 if TYPE_CHECKING:
     from coview_kernels.rays import TriangleTree
 
-EDGE = 1e-9  # of a triangle's side: a ray that meets the edge of two must not pass between them
-SLACK = 1e-9  # of a distance, and metres: more than rounding moves a side of a box
-THIN = 1e-18  # twice a triangle's area, seen along the ray, m2
-LEAST = 1e-30  # stands for a direction's zero
+EDGE = 1e-9  # share of a triangle's side, so that no ray passes between two triangles at their edge
+SLACK = 1e-9  # metres, and share of a distance: more than rounding moves a side of a box
+THIN = 1e-18  # least double area of a triangle seen along the ray, m2
+LEAST = 1e-30  # replaces zeros of a direction
 
 _BLOCK = 4096  # rays
 
@@ -32,7 +32,7 @@ def cast_rays(tree: TriangleTree, rays: F32) -> tuple[F32, I64]:
 
 
 def _pairs(tree: TriangleTree, rays: F64) -> tuple[I64, I64, F64]:
-    """Return the rays and the triangles that they meet, by their place in the tree, with the distances."""
+    """Return the pairs of a ray and a triangle on it, by its place in the tree, with the distances."""
     leaves = len(tree.axes)
     size = len(tree.rows) // leaves
     ray: I64 = np.arange(len(rays))
@@ -57,7 +57,7 @@ def _enter(boxes: F64, rays: F64) -> Mask:
 
 
 def _met(corners: F64, rays: F64) -> F64:
-    """Return the distances (N,) of triangles (N, 3, 3) along rays (N, 6), inf where they are not met (Moeller 1997)."""
+    """Return the distances (N,) of triangles (N, 3, 3) along rays (N, 6), inf without a hit (Moeller 1997)."""
     origin, towards = rays[:, :3], rays[:, 3:]
     one, other = corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]
     side = np.cross(towards, other)

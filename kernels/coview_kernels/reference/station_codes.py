@@ -1,4 +1,4 @@
-"""Correlations of a query with coded stations: the kernels' numbers, in wider registers or whole matrices."""
+"""Correlations of a query with coded stations: the kernels' results, in wider registers or whole matrices."""
 
 from __future__ import annotations
 
@@ -14,10 +14,10 @@ _LOW = 12  # rows of the first group
 
 
 def best_codes(codes: I16, query: I16, turn: I16) -> I32:
-    """Greatest correlation over the angles, (M,) int32, in units of the turn.
+    """Return the greatest correlation over the angles, (M,) int32, in units of the turn.
 
     Args:
-        codes: (M, 16, 16) int16, two numbers in each.
+        codes: (M, 16, 16) int16, two numbers each.
         query: (2, 16, 2, 16) int16, for real and imaginary products.
         turn: (65, 16) int16: zeros, cosines and sines of the blocks at the angles.
     """
@@ -45,7 +45,7 @@ def best_codes(codes: I16, query: I16, turn: I16) -> I32:
 
 
 def code_products(codes: I16, query: F32, stations: I32) -> F32:
-    """Products of the query's spectrum with stations (K,): (K, 2, 2, 16) by group, real and imaginary, and lane.
+    """Return the products (K, 2, 2, 16) of a query's spectrum with stations (K,), by group, real/imaginary and lane.
 
     Args:
         codes: (M, 16, 16) int16.
@@ -60,7 +60,7 @@ def code_products(codes: I16, query: F32, stations: I32) -> F32:
 
 
 def codes_at(codes: I16, table: F32, stations: I32, shifts: I32) -> F32:
-    """Correlations (K,) of stations (K,) at shifts (K,); 0 for station -1.
+    """Return the correlations (K,) of stations (K,) at shifts (K,); 0 for station -1.
 
     Args:
         codes: (M, 16, 16) int16.

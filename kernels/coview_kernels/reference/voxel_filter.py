@@ -19,7 +19,7 @@ def transform_unique(
 ) -> tuple[F32, int]:
     """See :func:`coview_kernels.transform_unique`."""
     x, y, z = points.astype(np.float64).T
-    # written out, not a BLAS product: the order of the roundings is part of the contract with the kernel
+    # written out, not a BLAS product, because the kernel must round in the same order
     with np.errstate(over="ignore", invalid="ignore"):
         r2 = (x - centre[0]) * (x - centre[0]) + (y - centre[1]) * (y - centre[1]) + (z - centre[2]) * (z - centre[2])
         moved = np.stack([row[0] * x + row[1] * y + row[2] * z + row[3] for row in T[:3]], axis=1)
@@ -32,7 +32,7 @@ def transform_unique(
 
 
 def _first_of_each(cells: F64) -> I64:
-    """Ascending indices of the first row of each distinct value in (N, 3) integral ``cells``."""
+    """Return the ascending indices of the first row of each distinct value in (N, 3) integral ``cells``."""
     offset = cells - cells.min(axis=0)
     spans = offset.max(axis=0) + 1.0
     if spans.prod() < 2.0**62:

@@ -8,7 +8,7 @@ from coview_kernels.arrays import I8, I32
 
 
 def window_products(raster: I8, images: I8, corners: I32, which: I32) -> I32:
-    """Return (N, D) sums over the cells of a window: twin of :func:`coview_kernels.window_products`."""
+    """Return sums (N, D) over the cells of a window; twin of :func:`coview_kernels.window_products`."""
     side = images.shape[1]
     step = np.arange(side)
     out = np.empty((len(corners), raster.shape[2]), dtype=np.int32)
