@@ -2,9 +2,8 @@
 """Taichi source of icp.py: one iteration per launch, with its searches spread over the threads.
 
 A partner is searched only when it may have changed, and is stored beside its point, so that an iteration with few
-searches reads memory in order. Waking the threads costs as much as an iteration over some hundred points. One thread
-therefore does the rest after the search, and with a single worker nothing is spread, as even one thread of the pool
-would have to be woken.
+searches reads memory in order. Waking the threads, even a single one, costs as much as an iteration over some hundred
+points. One thread therefore does all work after the search, and a single worker does everything itself.
 """
 
 from coview_kernels import runtime
@@ -24,8 +23,7 @@ SCATTER = 2.0  # distance between points that form no surface, in widths of the 
 MARGIN = 0.15  # metres by which a search exceeds its limit, to serve later poses; 0.05 to 0.3 are as fast
 BLOCK = 6  # 2^6 points per thread in turn, as points with long searches come in clusters
 
-# memory of a point: its position at the last search (3), and a lower bound of its distance to all map points except
-# its partner there
+# memory of a point: its position at the last search (3), and a lower bound of the distance to other points from there
 SAFE, PLACE = 3, 4
 # partner of a point: position (3) and normal (3); far away if there is none
 PARTNER = 6

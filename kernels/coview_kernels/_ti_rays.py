@@ -40,8 +40,7 @@ def met(corners: ti.template(), at, o, d) -> ti.f64:
 def enters(boxes: ti.template(), at, o, whole, best):
     """Return whether a ray enters the box with sides at index ``at`` nearer than ``best``; all in float32.
 
-    ``whole`` is one over the ray's direction. Minima and maxima are written out, because the library's handling of NaN
-    costs half.
+    ``whole`` is one over the ray's direction. Minima and maxima are written out: the library's NaN checks cost half.
     """
     near, far = ti.cast(0.0, ti.f32), best
     for k in ti.static(range(3)):

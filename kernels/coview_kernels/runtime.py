@@ -153,9 +153,8 @@ def _init(library: Any) -> None:
 def _cache_folder(library: Any) -> Path:
     """Return the folder of compiled kernels; for quadrants a subfolder, as it finds a kernel by its source.
 
-    That search (see :func:`kernel`) covers a kernel's functions but not their constants, so a hash of all our sources
-    names the subfolder. Its native code is loaded unchecked: if others may write there, a folder of this process is
-    used, and all kernels are recompiled.
+    That search (see :func:`kernel`) ignores the constants of a kernel's functions, so a hash of all our sources names
+    the subfolder. Native code is loaded unchecked: if others may write there, all is recompiled in a private folder.
     """
     quadrants = library.__name__ == "quadrants"
     named = os.environ.get(f"{'QD' if quadrants else 'TI'}_OFFLINE_CACHE_FILE_PATH")
