@@ -28,11 +28,11 @@ from coview_stream.errors import CoViewError
 
 
 class Benchmark(NamedTuple):
-    """The module of a benchmark's ``rows`` below ``bench``, one line about it, and its thread counts."""
+    """A benchmark: the module of its ``rows`` below ``bench``, one line about it, and its thread counts."""
 
     module: str
     about: str
-    threads: tuple[int | None, ...] = ()  # a process for each, None: as the machine has; without any, this process
+    threads: tuple[int | None, ...] = ()  # one process each, None: the machine's; empty: this process
 
     def load(self) -> Any:
         """Import its module."""
@@ -81,8 +81,8 @@ def counted(threads: int) -> str:
 def run(name: str, words: Sequence[str], threads: int | None) -> Iterator[Row]:
     """Yield the rows of ``python -m bench NAME WORDS`` as they come.
 
-    A benchmark that ends in an exception, is killed or yields nothing adds a row that does not hold; its own output is
-    shown on stderr only then. Raises CoViewError as it did.
+    A benchmark that raises, is killed or yields nothing adds a row that does not hold, and only then its own output is
+    shown on stderr. Its CoViewError is raised again.
     """
     conditions = (threads and counted(threads), "--quick" in words and "quick")
     label = "".join(f", {text}" for text in conditions if text)
@@ -137,7 +137,7 @@ def parser_of(name: str) -> argparse.ArgumentParser:
 
 
 def measured(name: str, words: Sequence[str], asked: argparse.Namespace) -> Iterator[Row]:
-    """Yield the rows of a benchmark: in this process, or in one for each of its thread counts."""
+    """Yield the rows of a benchmark, from this process or from one process per thread count."""
     benchmark, cores = BENCHMARKS[name], os.cpu_count() or 1
     if not benchmark.threads or asked.rows_to is not None:
         yield from benchmark.load().rows(asked)

@@ -54,7 +54,7 @@ WORLDS: dict[str, dict[str, Any]] = {
 """Simulated sites; seeds held out, as those of ``python -m bench accuracy``."""
 
 REAL, _REAL_METRES, _AROUND = ("riverside_a", "kitti04", "handheld_livox"), 72.0, 110.0
-"""Real runs; metres of them that are used, and metres around these that the map holds."""
+"""Real runs, the metres used of each, and the metres around these that are in the map."""
 
 
 def _with(**changes: Any) -> DescriptorConfig:
@@ -99,7 +99,7 @@ LOCALIZER = {
 """Choices of the whole localizer."""
 
 ELSEWHERE = {name: LOCALIZER[name] for name in ("default", "1 keyframes vote", "verification off", "risk 0.4")}
-"""Those that may let a wrong place through: runs on the map of the next site."""
+"""Choices that may accept a wrong place, for runs on the map of the next site."""
 
 GROUPS = (*SEARCH, "localizer", "elsewhere")
 SITES: dict[str, tuple[str, ...]] = {
@@ -109,11 +109,11 @@ SITES: dict[str, tuple[str, ...]] = {
     "elsewhere": ("airborne-like", "repetitive", "sparse", "dirty"),
     "spacing": ("airborne-like", "sparse", *REAL[:2]),
 }
-"""Sites of each group, so that all groups together take less than 40 minutes of one core."""
+"""Sites of each group, chosen so that all groups take less than 40 minutes of one core."""
 
 
 def sites(names: Sequence[str], data: Path) -> dict[str, Path]:
-    """Return the folders of sites by name, made unless they are there; ``data`` holds the real runs."""
+    """Return the folders of sites by name, created if missing; ``data`` holds the real runs."""
     out = {}
     for name in names:
         if name in WORLDS:
@@ -133,7 +133,7 @@ def _simulated(below: Path, changes: Mapping[str, Any]) -> Path:
 
 
 def _real(below: Path, source: Path) -> Path:
-    """Cut a real survey to the surroundings of the frames that are used, and build its map."""
+    """Crop a real survey to the surroundings of the used frames, and build its map."""
     out = below / "ablation" / source.name
 
     def make() -> None:
@@ -157,14 +157,14 @@ def _real(below: Path, source: Path) -> Path:
 
 
 def metres(name: str) -> float:
-    """Metres of a site's run that are used."""
+    """Return the metres used of a site's run."""
     return _REAL_METRES if name in REAL else _LENGTH
 
 
 def measure(
     name: str, place: Path, groups: Sequence[str], code: Mapping[str, str], other: Path
 ) -> dict[str, dict[str, Any]]:
-    """Measure groups on one site unless they are there; by group and variant, with ``cpu`` seconds of each group.
+    """Measure missing groups on one site; return results by group and variant, with ``cpu`` seconds per group.
 
     ``other`` is the folder of another site.
     """
@@ -197,7 +197,7 @@ def measure(
 
 
 def search_row(group: str, name: str, by_site: Mapping[str, Mapping[str, Any]]) -> Row:
-    """Row of a choice of the search over all sites: shares of keyframes; of each site that of the best place."""
+    """Return the row of a search choice: shares of keyframes over all sites, and per site that of the best place."""
 
     def share(key: str, of: str, some: Sequence[Mapping[str, Any]]) -> float:
         return float(sum(each[key] for each in some) / max(1.0, sum(each[of] for each in some)))
@@ -225,7 +225,7 @@ def search_row(group: str, name: str, by_site: Mapping[str, Mapping[str, Any]]) 
 
 
 def localizer_row(name: str, by_site: Mapping[str, Mapping[str, Any]]) -> Row:
-    """Row of a choice of the localizer; a run without a fix counts as an endless first fix."""
+    """Return the row of a localizer choice; a run without a fix counts as an infinite first fix."""
     every = list(by_site.values())
     first = [np.inf if each["first_fix_m"] is None else each["first_fix_m"] for each in every]
     found = sum(each["success"] for each in every)
@@ -239,7 +239,7 @@ def localizer_row(name: str, by_site: Mapping[str, Mapping[str, Any]]) -> Row:
 
 
 def elsewhere_row(name: str, by_site: Mapping[str, Mapping[str, Any]]) -> Row:
-    """Row of a choice of the localizer on maps of other places."""
+    """Return the row of a localizer choice on maps of other places."""
     posed, frames = (sum(each[key] for each in by_site.values()) for key in ("posed", "frames"))
     details = {
         "group": "elsewhere", "variant": name, "false": f"{posed} of {frames}",
@@ -310,7 +310,7 @@ COLUMNS = {
 
 
 def tables(rows: Sequence[Row], asked: Namespace) -> dict[str, str]:
-    """One table per group, below its sites and processor time; draws the picture."""
+    """Return one table per group, below its sites and processor time, and draw the picture."""
     out = {}
     for group in dict.fromkeys(row.details["group"] for row in rows):
         found = [row.details for row in rows if row.details["group"] == group]
@@ -328,7 +328,7 @@ def tables(rows: Sequence[Row], asked: Namespace) -> dict[str, str]:
 
 
 def draw(found: Sequence[Mapping[str, Any]], file: Path) -> None:
-    """Draw success and time against L = sigma_d, as the first paper's Fig. 9."""
+    """Draw success and time against L = sigma_d, like the first paper's Fig. 9."""
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 

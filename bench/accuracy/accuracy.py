@@ -57,7 +57,7 @@ Run = dict[str, Any]  # figures of ``evaluate`` and of the process
 
 
 def held_out_worlds() -> list[SimulationConfig]:
-    """24 worlds: every kind with every lidar, twice; sizes, lengths, changes and offsets in turn."""
+    """Return 24 worlds: every kind with every lidar, twice, with alternating sizes, lengths, changes and offsets."""
     return [
         SimulationConfig(
             KINDS[k % 4], LIDARS[k // 4 % 3], FIRST_SEED + k, _SIZES[(k + k // 6) % 6], _LENGTHS[(k + k // 5) % 5],
@@ -68,7 +68,7 @@ def held_out_worlds() -> list[SimulationConfig]:
 
 
 def pairs(quick: bool = False) -> list[tuple[SimulationConfig, SimulationConfig]]:
-    """(run, map) of all 24 worlds, then of 12 runs on the map of the next world of the same kind; or of 2 and 1."""
+    """Return (run, map) of 24 worlds, then of 12 runs on the map of the next world of that kind; quick: 2 and 1."""
     worlds = held_out_worlds()
     inside = [worlds[k] for k in (0, 21)] if quick else worlds  # small ones
     strangers = [(0, 16)] if quick else [(k, k + 4) for k in range(12)]
@@ -76,7 +76,7 @@ def pairs(quick: bool = False) -> list[tuple[SimulationConfig, SimulationConfig]
 
 
 def measure(world: Path, site: Path, inside: bool) -> Run:
-    """Localize a world's run on the map in a file; judged by the truth if the run is inside of that map."""
+    """Localize a world's run on the map in a file; evaluate it by the truth if the run is inside the map."""
     base_map = BaseMap.load(site)
     begin = time.perf_counter()
     located = locate(base_map, open_run(world / "run"))
@@ -95,7 +95,7 @@ def measure(world: Path, site: Path, inside: bool) -> Run:
 
 
 def evaluated(located: RunResult, world: Path) -> Run:
-    """Figures of ``evaluate`` for a world's run on its own map."""
+    """Return the figures of ``evaluate`` for a world's run on its own map."""
     poses = np.array([fix.T_map_body for fix in located.posed]).reshape(-1, 4, 4)
     estimate = np.array([fix.stamp for fix in located.posed]), poses
     return dict(json.loads(evaluate(estimate, read_tum(world / "truth.tum")).to_json()))
@@ -153,7 +153,7 @@ def figures(run: Run) -> Run:
 
 
 def verdicts(runs: Sequence[Run]) -> Iterator[Row]:
-    """Judge all runs together; without a fix the first fix is endless."""
+    """Judge all runs together; without a fix the first fix is infinite."""
     inside, outside = [r for r in runs if not r["outside"]], [r for r in runs if r["outside"]]
     succeeded, false = (sum(r[key] for r in inside) for key in ("success", "false_frames"))
     text = f"{succeeded} of {len(inside)}"
@@ -179,7 +179,7 @@ def dirty(world: SimulationConfig, kind: str) -> SimulationConfig:
 
 
 def dirty_run(below: Path, world: SimulationConfig, kind: str, call: Callable[..., Any] = isolated) -> Run:
-    """Measure a world with a kind of dirt, on a map of its own only where the dirt concerns the map."""
+    """Measure a world with a kind of dirt, on its own map only if the dirt concerns the map."""
     config = dirty(world, kind)
     run = run_one(below, config, config if _OF_THE_MAP & set(config.dirt.kinds) else world, call)
     if config != world:  # a hundred megabytes
@@ -188,7 +188,7 @@ def dirty_run(below: Path, world: SimulationConfig, kind: str, call: Callable[..
 
 
 def total(kind: str, runs: Sequence[Run]) -> Row:
-    """Row of one kind of dirt over all worlds: means over the runs; the median first fix counts no fix as endless."""
+    """Return the row of one kind of dirt: means over all runs; the median first fix counts no fix as infinite."""
     posed = [100.0 * run["posed"] / run["frames"] if run.get("frames") else 0.0 for run in runs]
     first = [np.inf if run.get("first_fix_m") is None else run["first_fix_m"] for run in runs]
     names = {"rmse_t": "translation", "rmse_r": "rotation"}
@@ -231,7 +231,7 @@ def rows(asked: Namespace) -> Iterator[Row]:
 
 
 def tables(rows: Sequence[Row], asked: Namespace) -> dict[str, str]:
-    """All runs, the same beside the paper's, and all kinds of dirt."""
+    """Return tables of all runs, of the runs beside the paper's, and of all kinds of dirt."""
     runs = [figures(row.details) for row in rows if row.details and "dirt" not in row.details]
     kinds = [row.details for row in rows if "dirt" in row.details]
     parts = {"": (COLUMNS, runs), "dirt": (DIRT_COLUMNS, kinds)}

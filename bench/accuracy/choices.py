@@ -47,7 +47,7 @@ _SAMPLE = 100_000  # distances that a median is taken of
 
 @dataclass(frozen=True)
 class Choice:
-    """The search with some of its choices made otherwise.
+    """The search with some choices changed.
 
     Attributes:
         descriptor: of stations and keyframes.
@@ -91,7 +91,7 @@ class Site:
         return describe_storeys(self.points, self.stations(block), block, descriptor)[descriptor.channels[0]]
 
     def _keyframes(self, distance: float) -> list[KeyframeView]:
-        """Keyframes of the run in order, every ``distance`` metres."""
+        """Return the keyframes of the run in order, every ``distance`` metres."""
         settings, out = KeyframeConfig(distance=distance), []
         buffer, descriptor = KeyframeBuffer(settings), DescriptorConfig(radius=100.0)
         for frame in self.run:
@@ -110,7 +110,7 @@ class Site:
     def _volumes(self, choice: Choice) -> list[tuple[Floats, Floats32, float]]:
         """Zero (3,) of each keyframe, its distances (M, S) by a choice of one channel, and their processor seconds."""
         descriptor = choice.descriptor
-        # the zero is the keyframe's affair: it does not change the stations
+        # the zero concerns only the keyframe, not the stations
         stations = self.described(choice.spacing, replace(descriptor, ground_zero=True))
         out = []
         for seen in self.keyframes(choice.spacing):
@@ -155,7 +155,7 @@ class Site:
         return BaseMap(arrays, self.map.parameters | {"config": config})
 
     def elsewhere(self, choice: LocalizerChoice, folder: Path) -> dict[str, Any]:
-        """Localize the run on the map of another site: count the poses, all of them false."""
+        """Localize the run on the map of another site, and count the poses, which are all false."""
         with choice.changed():
             found = locate(BaseMap.load(folder / "site.coview"), self.run, choice.config)
         return {"posed": len(found.posed), "frames": found.frames}
@@ -178,7 +178,7 @@ class Site:
 
 @dataclass(frozen=True)
 class LocalizerChoice:
-    """The whole localizer with some of its choices made otherwise.
+    """The whole localizer with some choices changed.
 
     Attributes:
         config: of the localizer.
@@ -218,7 +218,7 @@ class TableVote:
 
     @classmethod
     def of_distances(cls, centre: Floats, volumes: Sequence[Floats32]) -> TableVote:
-        """Average the standardised distances (M, S) of each channel: the distances themselves do not compare."""
+        """Average the standardised distances (M, S) of the channels, whose raw distances are not comparable."""
         scores = [robust_zscore(volume) for volume in volumes]
         return cls(centre, sum(scores[1:], start=scores[0]) * np.float32(1.0 / len(scores)))
 
@@ -233,11 +233,11 @@ class TableVote:
         return station, shift
 
     def at(self, stations: Ints, shifts: Ints) -> Floats32:
-        """Look z-scores (K,) up; 0 for station -1."""
+        """Look up z-scores (K,); 0 for station -1."""
         return np.where(stations < 0, np.float32(0.0), self.scores[stations, shifts])
 
     def at_all(self, requests: Sequence[tuple[TableVote, Ints, Ints]]) -> list[Floats32]:
-        """Look all up, one after the other."""
+        """Return the result of :meth:`at` for each request."""
         return [vote.at(stations, shifts) for vote, stations, shifts in requests]
 
 
@@ -251,7 +251,7 @@ def robust_zscore(volume: Floats32) -> Floats32:
 
 
 def right(T_map_odom: Pose, seen: KeyframeView) -> bool:
-    """Whether a hypothesis puts the keyframe at its true place and heading; heights are not compared."""
+    """Return whether a hypothesis puts the keyframe at its true place and heading, regardless of height."""
     found, true = (transform(T, seen.position[None])[0] for T in (T_map_odom, seen.T_map_odom))
     turn = wrap_angle(yaw_of(T_map_odom) - yaw_of(seen.T_map_odom))
     return bool(np.hypot(*(found - true)[:2]) < NEAR and abs(turn) < ALIGNED)

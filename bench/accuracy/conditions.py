@@ -74,17 +74,17 @@ class Variant:
         return np.ascontiguousarray(points, dtype=np.float32)
 
     def changed(self, change: Callable[[Points], Points]) -> Variant:
-        """Return it with one more change of the clouds."""
+        """Return the variant with one more change of the clouds."""
         return replace(self, changes=(*self.changes, change))
 
     def chosen(self, of: slice) -> Variant:
-        """Return it with some of its frames, in that order."""
+        """Return the variant with some of its frames, in that order."""
         odometry, truth = self.odometry[of], self.truth[of]
         return replace(self, frames=self.frames[of], stamps=self.stamps[of], odometry=odometry, truth=truth)
 
 
 def spoilt(condition: str, run: Variant, seed: int) -> Variant:
-    """Return the run under a condition; the same seed makes the same.
+    """Return the run under a condition; equal seeds give equal runs.
 
     Raises:
         InputError: no such condition, or wrong figures.
@@ -180,7 +180,7 @@ class RealSet:
                 raise InputError(f"{path}: not there; a set has base.laz, run/ and truth.tum (--data, --sets)")
 
     def airborne(self, density: float) -> tuple[Path, dict[str, Any]]:
-        """Return the airborne-like cloud of so many pulses per m2, made unless it is there, and its share of walls."""
+        """Return the airborne-like cloud of so many pulses per m2, created if missing, and its share of walls."""
         file = folder() / "conditions" / "airborne" / f"{self.name}-{density:g}.laz"
 
         def make() -> dict[str, Any]:
@@ -194,10 +194,10 @@ class RealSet:
         return file, remembered(file.with_suffix(".json"), spec | {"code": fingerprint(*_AIRBORNE)}, make)
 
     def cut(self, percent: float) -> tuple[Path, float]:
-        """Return the survey without as many of its squares as leave the overlap of the run, and that overlap, per cent.
+        """Remove squares of the survey until the run's overlap is as asked; return the rest and the overlap, per cent.
 
-        Squares of :data:`_SQUARE` are left out in a random order, on the whole site alike. The overlap is the share of
-        the run's points that have a map point within half a metre at the true pose.
+        Squares of :data:`_SQUARE` are removed in random order over the whole site. The overlap is the share of the
+        run's points that have a map point within half a metre at the true pose.
         """
         file = folder() / "conditions" / "cut" / f"{self.name}-{percent:g}.laz"
 
@@ -240,7 +240,7 @@ class RealSet:
 
 
 def set_of(name: str, data: Path) -> RealSet:
-    """Return a set of ``data``, or else the world that SCENE-SENSOR-SEED names: 120 m wide, a drive of 24 m."""
+    """Return a set of ``data``, else the world SCENE-SENSOR-SEED, 120 m wide with a drive of 24 m."""
     scene, *words = name.split("-", 1)
     sensor, _, seed = "".join(words).rpartition("-")
     if (data / name).exists() or sensor not in SENSORS or not seed.isdecimal():
@@ -250,7 +250,7 @@ def set_of(name: str, data: Path) -> RealSet:
 
 
 def located(real: RealSet, condition: str, site: Path, below: Path) -> dict[str, Any]:
-    """Localize a set under a condition on a map with the command, unless the result is there; return its scores."""
+    """Localize a set under a condition on a map with the command, unless a result exists; return its scores."""
     place = condition.replace(":", "_")
     run, out = below / "runs" / real.name / place / "run", below / "located" / site.stem / place
     spec = {"set": real.name, "condition": condition, "bench": fingerprint("bench/accuracy/conditions.py")}
@@ -265,7 +265,7 @@ def located(real: RealSet, condition: str, site: Path, below: Path) -> dict[str,
 
 
 def by_paper(real: RealSet, condition: str, site: Path, below: Path) -> dict[str, Any]:
-    """Return the answers of the first paper's method to a run that :func:`located` has made, unless they are there."""
+    """Return the answers of the first paper's method to a run of :func:`located`, computed if missing."""
     place = condition.replace(":", "_")
     world = below / "runs" / real.name / place
 
@@ -410,7 +410,7 @@ def _bin(percent: float, runs: Sequence[dict[str, Any]]) -> dict[str, Any]:
 
 
 def tables(rows: Sequence[Row], asked: Namespace) -> dict[str, str]:
-    """All runs; with ``--paper`` they stand beside the paper's, with ``--overlaps`` below a summary."""
+    """Return tables of all runs, with ``--paper`` beside the paper's, with ``--overlaps`` below a summary."""
     runs = [row.details for row in rows if "set" in row.details]
     if asked.overlaps:
         bins = listed(BINS, [_bin(percent, runs) for percent in asked.overlaps])

@@ -43,11 +43,11 @@ _GONE = 0.25  # share of the buildings that are gone, and of those that are new
 _SITES = (("town", "vlp16"), ("campus", "mid360"), ("village", "os64"), ("industrial", "vlp16"))
 
 Change = Callable[..., Floats]
-"""x, y (N,) and the drive's places (M, 2) -> metres by which the ground has risen (N,)."""
+"""x, y (N,) and the drive's places (M, 2) -> rise of the ground (N,), metres."""
 
 
 def _round(x: Floats, y: Floats, place: Floats, inner: float, outer: float) -> Floats:
-    """One within ``inner`` metres of a place, zero beyond ``outer``, smooth between."""
+    """Return one within ``inner`` metres of a place, zero beyond ``outer``, smooth between."""
     inside = np.clip((outer - np.hypot(x - place[0], y - place[1])) / (outer - inner), 0.0, 1.0)
     return np.asarray(inside**2 * (3.0 - 2.0 * inside))
 
@@ -119,7 +119,7 @@ def _changed(asked: Namespace) -> Iterator[Row]:
 
 
 def _site(config: SimulationConfig) -> tuple[BaseMap, Scene, Poses, Any]:
-    """Return the map of a site, its scene, the level drive, and what stands there now."""
+    """Return the map of a site, its scene, the level drive, and the present objects."""
     scene = scene_of(config)
     level = trajectories(scene, config)[1]
     gone, new, _ = np.split(

@@ -70,7 +70,7 @@ class LocalScan:
 
 
 def local_scans(run: Run, sigma_d: float = BLOCK) -> Iterator[LocalScan]:
-    """VLS of every ``sigma_d`` metres of odometry, of the frames since the last; the first frame makes one, too.
+    """Yield a VLS every ``sigma_d`` metres of odometry, of the frames since the last; also one of the first frame.
 
     Coordinates are relative to the first frame's position.
     """
@@ -95,7 +95,7 @@ def ring_key(descriptor: Floats32) -> Floats32:
 
 
 def unit_columns(descriptor: Floats32) -> Floats32:
-    """Return descriptors (..., R, S) with columns of length 1; empty ones stay zero."""
+    """Scale the columns of descriptors (..., R, S) to length 1; empty columns stay zero."""
     length = np.linalg.norm(descriptor, axis=-2, keepdims=True)
     return np.asarray(descriptor / np.where(length > 0, length, 1.0), dtype=np.float32)
 
@@ -186,7 +186,7 @@ def trimmed_icp(source: Floats, target: Floats, T: Pose, overlap: float = OVERLA
 
 
 def rigid(points: Floats, targets: Floats) -> Pose:
-    """Return the pose (4, 4) that moves points (N, 3) onto targets (N, 3) with least squares."""
+    """Return the least-squares pose (4, 4) that moves points (N, 3) onto targets (N, 3)."""
     a, b = points.mean(axis=0), targets.mean(axis=0)
     U, _, Vt = np.linalg.svd((targets - b).T @ (points - a))
     R = U * [1.0, 1.0, np.linalg.det(U @ Vt)] @ Vt  # no reflection
@@ -199,7 +199,7 @@ Answers = dict[str, dict[str, Any]]  # by way
 def located(
     base_map: BaseMap, run: Run, truth: Poses, spacing: float = BLOCK, stations: Floats32 | None = None
 ) -> Answers:
-    """Localize a run in all ways; judged by the true poses (F, 4, 4) map <- body of all frames.
+    """Localize a run in all ways, and judge the results by the true poses (F, 4, 4) map <- body of all frames.
 
     L = sigma_d is ``spacing``, metres; for another than the map's give the ``stations`` (M, 3).
 

@@ -16,7 +16,7 @@ from coview_stream.geometry.arrays import Bools, Floats
 from coview_stream.localization.result import Fix
 
 FALSE_METRES, FALSE_DEGREES = 1.0, 5.0  # a pose further from the truth than either is false
-MAX_HELD = 0.5  # seconds that a false pose counts at most: until the next frame, or so long
+MAX_HELD = 0.5  # most seconds for which a false pose counts, if no frame follows sooner
 
 
 @dataclass(frozen=True)
@@ -46,13 +46,13 @@ class Track:
 
     @classmethod
     def of_poses(cls, stamps: Floats, poses: Floats) -> Track:
-        """Track of poses (N, 4, 4), NaN where there is none, without covariances."""
+        """Return the track of poses (N, 4, 4), NaN where there is none, without covariances."""
         states = np.where(np.isnan(poses[:, 0, 0]), "SEARCHING", "TRACKING").tolist()
         return cls(stamps, states, poses, *(np.full((len(poses), *shape), np.nan) for shape in ((6, 6), (4,))))
 
     @property
     def tracking(self) -> Bools:
-        """(N,) whether the frame has a pose."""
+        """Mask (N,) the frames with a pose."""
         posed = ~np.isnan(self.poses[:, 0, 0])
         return np.asarray(posed & (np.asarray(self.states) == "TRACKING"))
 
@@ -67,7 +67,7 @@ class Errors:
 
     @property
     def right(self) -> Bools:
-        """(N,) whether the frame has a pose that is not false."""
+        """Mask (N,) the frames with a pose that is not false."""
         return np.asarray((self.metres <= FALSE_METRES) & (self.degrees <= FALSE_DEGREES))
 
 
@@ -85,7 +85,7 @@ def errors(track: Track, truth: Floats) -> Errors:
 
 
 def held(stamps: Floats) -> Floats:
-    """(N,) seconds for which each frame's answer counts: until the next frame, at most :data:`MAX_HELD`."""
+    """Return the seconds (N,) for which each frame's answer counts: to the next frame, at most :data:`MAX_HELD`."""
     if len(stamps) < 2:
         return np.zeros(len(stamps))
     gaps = np.diff(stamps)
@@ -93,7 +93,7 @@ def held(stamps: Floats) -> Floats:
 
 
 def recovery(right: Bools, driven: Floats, end: int) -> float | None:
-    """Metres driven from the frame ``end`` to the first right pose; None if there is none."""
+    """Return the metres driven from the frame ``end`` to the first right pose; None if there is none."""
     return float(driven[end + int(right[end:].argmax())] - driven[end]) if right[end:].any() else None
 
 
@@ -103,9 +103,9 @@ def losses(states: Sequence[str]) -> int:
 
 
 def score(track: Track, truth: Floats, driven: Floats, events: Sequence[int]) -> dict[str, Any]:
-    """All figures of one drive but coverage; metres, degrees, seconds; None where there is no pose.
+    """Return all figures of one drive except coverage; metres, degrees, seconds; None without a pose.
 
-    Of the true poses (N, 4, 4) map <- body, (N,) metres ``driven``, and the first frame after each event.
+    Takes the true poses (N, 4, 4) map <- body, metres ``driven`` (N,), and the first frame after each event.
     """
     error, known = errors(track, truth), track.tracking
     false = known & ~error.right

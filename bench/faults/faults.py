@@ -48,11 +48,11 @@ class Feed:
 
     @property
     def later(self) -> Ints:
-        """The frames from the fault on."""
+        """Frames from the fault on."""
         return np.arange(self.begins, len(self))
 
     def changed(self, change: Callable[[int, Points], Points | Floats]) -> Feed:
-        """Return it with other clouds from the fault on: ``change`` gets the frame's number and its cloud."""
+        """Return the run with other clouds from the fault on; ``change`` gets the frame's number and its cloud."""
         kept = list(self.clouds[: self.begins])
         return replace(self, clouds=kept + [_cloud(change(int(k), self.clouds[k])) for k in self.later])
 
@@ -69,7 +69,7 @@ class Feed:
         return interpolate(poses[after - 1], poses[after], np.clip(share, 0.0, 1.0))
 
     def stamped(self, late: Floats) -> Feed:
-        """Return it with clouds whose stamps are ``late`` by (K,) seconds; those after the end of odometry go."""
+        """Return the run with clouds stamped ``late`` by (K,) seconds, without clouds after the end of odometry."""
         stamps = self.stamps + late
         rows = np.flatnonzero(stamps <= self.stamps[-1])
         picked = self.picked(rows)
@@ -81,7 +81,7 @@ class Feed:
         )  # fmt: skip
 
     def moved(self, step: Callable[[int, Floats, float], tuple[Floats, float]]) -> Feed:
-        """Return it with other odometry from the fault on.
+        """Return the run with other odometry from the fault on.
 
         ``step`` gets a frame's number, its step (3,) along the level axes of the frame before, metres, and its turn
         about the vertical, radians, and returns others. Roll and pitch stay odometry's.
@@ -150,13 +150,13 @@ def _stutter(feed: Feed, rng: np.random.Generator) -> Feed:
 
 
 def _late(feed: Feed, rng: np.random.Generator, seconds: float = 0.0, growth: float = 0.0) -> Feed:
-    """Stamp clouds late, by so many seconds and so many more each second."""
+    """Stamp clouds late by ``seconds`` and by ``growth`` more each second."""
     since = feed.clock - feed.clock[feed.begins]
     return feed.stamped(np.where(since < 0, 0.0, seconds + growth * since))
 
 
 def _odometry_late(feed: Feed, rng: np.random.Generator, seconds: float) -> Feed:
-    """Let odometry say where the robot was; until the first late one it stands still."""
+    """Delay odometry, which stands still until the first late pose."""
     begin = feed.clock[feed.begins]
     then = np.where(feed.clock < begin, feed.clock, np.maximum(begin, feed.clock - seconds))
     return replace(feed, odometry=feed.at(feed.odometry, then))
@@ -178,7 +178,7 @@ def _long(feed: Feed, rng: np.random.Generator) -> Feed:
 
 
 def _slipping(feed: Feed, rng: np.random.Generator) -> Feed:
-    """Let the wheels spin, one second of every six: odometry goes half as far again."""
+    """Let the wheels spin for one second in six, when odometry counts half as far again."""
     since = feed.clock - feed.clock[feed.begins]
     return feed.moved(lambda k, step, turn: (step * (1.5 if since[k] % 6.0 < 1.0 else 1.0), turn))
 
@@ -208,7 +208,7 @@ def _shifted(feed: Feed, rng: np.random.Generator, metres: float, start: bool = 
 
 
 def _kidnapped(feed: Feed, rng: np.random.Generator) -> Feed:
-    """Carry the robot over a part of its way, unseen; by odometry it stands still meanwhile."""
+    """Carry the robot along a part of its path, unseen, while it stands still by odometry."""
     at, there = feed.begins, min(feed.begins + round(_KIDNAPPED * len(feed)), len(feed) - 2)
     rows = np.r_[0:at, there : len(feed)]
     picked = feed.picked(rows)
@@ -220,7 +220,7 @@ def _kidnapped(feed: Feed, rng: np.random.Generator) -> Feed:
 
 
 def _standing(feed: Feed, rng: np.random.Generator) -> Feed:
-    """Let the robot stand still to the end: the noise of its lidar goes on."""
+    """Let the robot stand still to the end, with a noisy lidar."""
     at = feed.begins
     odometry, truth, way = feed.odometry.copy(), feed.truth.copy(), feed.way.copy()
     odometry[at:], truth[at:], way[at:] = odometry[at], truth[at], way[at]

@@ -65,7 +65,7 @@ LOG = logging.getLogger("coview_stream")
 
 @functools.cache
 def _folder() -> Path:
-    """Make a folder, in memory where the machine has /dev/shm."""
+    """Create a folder, in memory if the machine has /dev/shm."""
     memory = Path("/dev/shm")
     folder = Path(tempfile.mkdtemp(prefix="coview-fuzz-", dir=memory if os.access(memory, os.W_OK) else None))
     atexit.register(shutil.rmtree, folder, ignore_errors=True)
@@ -197,7 +197,7 @@ class Watch:
         faulthandler.cancel_dump_traceback_later()
 
     def write(self, done: bool = False) -> None:
-        """Write the counts; ``done`` tells that no input ended the process."""
+        """Write the counts; ``done`` states that no input ended the process."""
         self._written = time.monotonic()
         self.books["peak_mb"] = _peak_mb()
         (self._found / "result.part").write_text(json.dumps(self.books | {"done": done}))

@@ -27,7 +27,7 @@ from coview_stream.errors import InputError
 ROOT = Path(__file__).parents[2]
 
 PYTHON = (sys.executable, "-P")
-"""Begins a command: this interpreter, with no import root but those of :func:`environment`."""
+"""Start of a command: this interpreter, with the import roots of :func:`environment` only."""
 
 _ROOTS = {path.name: path for path in (*map(Path, (*coview_stream.__path__, *coview_kernels.__path__)), ROOT / "bench")}
 
@@ -66,10 +66,10 @@ def locked(file: Path, wait: bool = True) -> Iterator[None]:
 
 
 def remembered(file: Path, spec: dict[str, Any], make: Callable[[], Any], wait: bool = True) -> dict[str, Any]:
-    """Return the result in ``file`` if it was made for an equal ``spec``; else make it and store it there.
+    """Return the result in ``file`` if it belongs to an equal ``spec``; else compute it with ``make`` and store it.
 
     ``spec`` holds a :func:`fingerprint` of the code. Only a dictionary is stored; ``make`` may write files itself.
-    Processes side by side make it once; without ``wait`` there is a BlockingIOError while another one does.
+    Only one of several processes computes it; without ``wait`` the others get a BlockingIOError meanwhile.
     """
     spec = json.loads(json.dumps(spec))
     beside = file.parent.with_name(f"{file.parent.name}-{file.stem}.lock")  # what makes a world wants an empty folder
@@ -84,9 +84,9 @@ def remembered(file: Path, spec: dict[str, Any], make: Callable[[], Any], wait: 
 
 
 def fingerprint(*parts: str) -> str:
-    """Short hash of the code and weights below ``parts``, e.g. ``coview_stream/sim`` (none: of the whole product).
+    """Return a short hash of the code and weights below ``parts``, e.g. ``coview_stream/sim``, by default of all.
 
-    Comments, docstrings and layout do not count: prose does not age a figure.
+    Comments, docstrings and layout do not count, as prose does not invalidate a figure.
     """
     total = hashlib.sha256()
     for part in parts or ("coview_stream", "coview_kernels"):
@@ -124,12 +124,12 @@ def peak_megabytes() -> float:
 
 
 def thread_settings(threads: int) -> dict[str, str]:
-    """Return the environment that gives BLAS, OpenMP and our kernels so many threads."""
+    """Return the environment that limits BLAS, OpenMP and our kernels to a number of threads."""
     return dict.fromkeys(("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "COVIEW_THREADS"), str(threads))
 
 
 def environment(threads: int | None = None) -> dict[str, str]:
-    """Return our environment with the import roots of this checkout in front; the machine's threads, or so many."""
+    """Return our environment with this checkout's import roots first, and ``threads`` or the machine's."""
     path = os.pathsep.join(filter(None, (str(ROOT), str(ROOT / "kernels"), os.environ.get("PYTHONPATH"))))
     return {**os.environ, "PYTHONPATH": path, **(thread_settings(threads) if threads else {})}
 
@@ -143,7 +143,7 @@ def command(*words: str | Path, threads: int) -> subprocess.CompletedProcess[str
 def trajectory(site: Path, run: Path, out: Path) -> Path:
     """Return the trajectory that ``coview-stream locate`` writes for a run, perhaps an empty one; InputError if none.
 
-    Its exit code is 1 where no frame has a pose, and after a traceback.
+    Its exit code is 1 if no frame has a pose, and also after a traceback.
     """
     found = out / "trajectory.tum"
     found.unlink(missing_ok=True)
@@ -154,7 +154,7 @@ def trajectory(site: Path, run: Path, out: Path) -> Path:
 
 
 def built(source: Path, site: Path) -> Path:
-    """Return the map that ``coview-stream build`` makes of a cloud; build it unless it is there."""
+    """Return the map of a cloud by ``coview-stream build``, built if missing."""
 
     def build() -> None:
         site.parent.mkdir(parents=True, exist_ok=True)

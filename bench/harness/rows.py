@@ -98,56 +98,56 @@ def medians(*sides: Callable[[], object], repeat: int = REPEAT, warm_up: int = 1
 
 
 def against(name: str, ours: float, baseline: float, unit: str, least: float | None) -> Row:
-    """Row of two figures, the smaller the better; the target is ``least`` times better (None: informs)."""
+    """Return the row of two figures, smaller is better; the target is ``least`` times better (None: informs)."""
     ratio = baseline / ours if ours > 0 else math.nan
     target, holds = ("", None) if least is None else (f">= {least:g}", bool(ratio >= least))
     return Row(name, ours, baseline, unit, ratio, target, holds)
 
 
 def bounded(name: str, value: float, unit: str, most: float) -> Row:
-    """Row of one figure that may be ``most`` at most; NaN does not hold."""
+    """Return the row of a figure that must be at most ``most``; NaN does not hold."""
     return Row(name, float(value), None, unit, None, f"<= {most:g} {unit}".rstrip(), bool(value <= most))
 
 
 def reached(name: str, value: float, unit: str, least: float) -> Row:
-    """Row of one figure that has to be ``least`` at least; NaN does not hold."""
+    """Return the row of a figure that must be at least ``least``; NaN does not hold."""
     return Row(name, float(value), None, unit, None, f">= {least:g} {unit}".rstrip(), bool(value >= least))
 
 
 def judged(name: str, text: str, target: str, holds: bool | None, value: float = math.nan) -> Row:
-    """Row of a finding in words, with the number behind it if there is one."""
+    """Return the row of a finding in words, with its number if there is one."""
     return Row(name, float(value), target=target, holds=holds, text=text)
 
 
 def informs(name: str, value: float, unit: str, details: dict[str, Any] | None = None) -> Row:
-    """Row of one figure without a target."""
+    """Return the row of a figure without a target."""
     return Row(name, float(value), unit=unit, details=details or {})
 
 
 def failed(name: str, why: str) -> Row:
-    """Row of a benchmark without a figure; it does not hold."""
+    """Return the row of a benchmark without a figure; it does not hold."""
     return Row(f"{name}: {why}", target="runs", holds=False)
 
 
 def line(cells: Sequence[str], widths: Sequence[int]) -> str:
-    """One table row; the first column to the left, the others to the right."""
+    """Return a table row, the first column left-aligned, the others right-aligned."""
     first, *rest = (cell.rjust(width) for cell, width in zip(cells, widths, strict=True))
     return "| " + " | ".join([first.strip().ljust(widths[0]), *rest]) + " |"
 
 
 def rule(widths: Sequence[int]) -> str:
-    """Line between a table's head and its body."""
+    """Return the line between a table's head and body."""
     return "|" + "|".join(["-" * (widths[0] + 2), *("-" * (w + 1) + ":" for w in widths[1:])]) + "|"
 
 
 def table(head: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
-    """Whole table, its columns as wide as they need to be."""
+    """Return a table with columns as wide as needed."""
     widths = [max(len(row[k]) for row in (head, *rows)) for k in range(len(head))]
     return "\n".join([line(head, widths), rule(widths), *(line(row, widths) for row in rows)])
 
 
 def listed(columns: Sequence[tuple[str, str, int | None]], figures: Iterable[Mapping[str, Any]]) -> str:
-    """Table of figures; columns are heading, key and decimals, or None where the figure is a text."""
+    """Return a table of figures; columns are heading, key and decimals, None for a text."""
     rows = [[str(f[key]) if k is None else number(f[key], k) for _, key, k in columns] for f in figures]
     return table([head for head, *_ in columns], rows)
 

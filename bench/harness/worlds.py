@@ -28,7 +28,7 @@ from coview_stream.sim import SimulationConfig, simulate
 from coview_stream.sim.dirt import KINDS_OF_DIRT, REAL
 
 TUNED_SEEDS = frozenset(range(1, 21))
-"""Seeds of ``coview_stream.sim`` that defaults were chosen on; those of the unit tests are among them."""
+"""Seeds of ``coview_stream.sim`` on which defaults were chosen, including those of the unit tests."""
 
 KINDS = ("town", "campus", "village", "industrial")
 LIDARS = ("vlp16", "os64", "mid360")
@@ -41,7 +41,7 @@ MAPPER = (*(f"coview_stream/{part}" for part in ("sim", "basemap", "clouds", "de
 
 
 def world_name(config: SimulationConfig) -> str:
-    """Directory of a world below the benchmark's folder."""
+    """Return the name of a world's directory below the benchmark's folder."""
     dirt = REAL if config.dirt.kinds == KINDS_OF_DIRT else "+".join(config.dirt.kinds)
     drive = f"-drive{config.drive_seed}" if config.drive_seed else ""
     return f"{config.scene}-{config.sensor}-{config.seed}{drive}" + (f"-{dirt}" if dirt else "")
@@ -53,7 +53,7 @@ def map_of(below: Path, config: SimulationConfig) -> Path:
 
 
 def prepared_run(below: Path, config: SimulationConfig) -> Path:
-    """Return a world's directory; simulate it there unless that is done."""
+    """Return a world's directory, simulated if missing."""
     out = below / world_name(config)
     world = {"world": config.to_dict(), "code": fingerprint(*SIMULATOR)}
     remembered(out / "simulated.json", world, lambda: simulate(out, config, overwrite=True))
@@ -61,7 +61,7 @@ def prepared_run(below: Path, config: SimulationConfig) -> Path:
 
 
 def prepare(below: Path, config: SimulationConfig) -> Path:
-    """Return a world's directory; simulate it and build its map there unless that is done."""
+    """Return a world's directory, simulated and with its map built if missing."""
     out, site = prepared_run(below, config), map_of(below, config)
     made = {"map": asdict(MapConfig()), "code": fingerprint(*MAPPER)}
     remembered(out / "built.json", made, lambda: BaseMap.build(out / "base.laz").save(site))
@@ -80,7 +80,7 @@ WORLDS = {
     "town": SimulationConfig("town", "vlp16", seed=2201, size=240.0, length=90.0),
     "campus": SimulationConfig("campus", "os64", seed=2202, size=240.0, length=90.0),
 }
-"""Airborne base map (20 pulses per square metre), ground run; seeds that nothing was tuned on."""
+"""Airborne base map (20 pulses per square metre), ground run; seeds on which nothing was tuned."""
 
 
 @dataclass(frozen=True)
@@ -92,7 +92,7 @@ class Place:
     T_map_submap: Pose  # (4, 4) the truth; the map's coordinates are relative to its origin
 
     def errors(self, T_map_submap: Pose) -> tuple[float, float]:
-        """Distance (metres) and angle (degrees) of an answer from the truth."""
+        """Return the distance (metres) and angle (degrees) of an answer from the truth."""
         off = inverse(self.T_map_submap) @ T_map_submap
         return float(np.linalg.norm(off[:3, 3])), float(np.degrees(rotation_angle(off)))
 
@@ -103,7 +103,7 @@ class Place:
 
 
 def places(site: BaseMap, run: Run, truth: Floats, count: int, keyframes: int = KEYFRAMES) -> list[Place]:
-    """``count`` places with so many keyframes each, evenly along a run with true poses (N, 4, 4) on a map."""
+    """Return ``count`` places of ``keyframes`` each, evenly along a run with true poses (N, 4, 4) on a map."""
     way = driven(run.poses)
     last = max(0.0, way[-1] - keyframes * KeyframeConfig().distance)
     return [_place(run, truth, int(k), site, keyframes) for k in np.searchsorted(way, np.linspace(0.0, last, count))]
