@@ -1,1 +1,1 @@
-"""What prints the figures of the documentation: ``python -m bench``."""
+"""Benchmarks that print the figures of the documentation: ``python -m bench``."""

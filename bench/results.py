@@ -54,7 +54,7 @@ class Table(NamedTuple):
     minutes: float  # about, on quiet cores, until the page says how long it took
     beside: bool = False  # runs beside others, on a core of its own: no time in it has a target
     quick: str = ""  # the command beside --quick, if it is another one
-    thinned: str = ""  # what is left out, so that all ends in twelve hours
+    thinned: str = ""  # parts left out, so that everything ends within twelve hours
 
 
 SETS_OF_TWO = "--sets kitti04 handheld_livox --conditions base pitch:3"

@@ -1,8 +1,8 @@
-"""An agent whose loop never waits: each frame is handed over, and the newest pose is there at once.
+"""An agent whose loop never waits: it hands over each frame, and gets the newest pose at once.
 
     coview-stream demo && python examples/agent.py coview-demo/world
 
-Two processes search the map and register frames meanwhile. Nothing of it needs a network.
+Two processes search the map and register frames meanwhile, without a network.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ def main(world: Path, period: float = 0.1) -> tuple[Fix, float]:
         BaseMap.build(world / "base.laz").save(site)
     longest = 0.0
     with AsyncLocalizer(site) as localizer:
-        localizer.prepare()  # some seconds, the first time more; without it the first fix comes that much later
+        localizer.prepare()  # takes some seconds, more the first time; without it the first fix is later by this time
         for frame in open_run(world / "run"):
             begin = time.perf_counter()
             try:

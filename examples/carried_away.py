@@ -1,4 +1,4 @@
-"""A robot that is switched off, carried elsewhere and switched on: it is told to look again, and finds itself.
+"""A robot that is switched off, carried elsewhere and switched on: told to search again, it is found.
 
 coview-stream demo && python examples/carried_away.py coview-demo/world
 """
@@ -22,7 +22,7 @@ def main(world: Path) -> list[float]:
     for name, drive in (("first drive", frames[: len(frames) // 2]), ("carried back", frames)):
         begin, stamp = drive[0], drive[0].stamp if not found else frames[-1].stamp + 60.0
         if found:
-            # the same map, and an odometry that did not notice: without this it has to find out by itself
+            # the odometry did not notice the move: without this call the localizer has to detect it
             localizer.relocalize()
         for frame in drive:
             fix = localizer.step(frame.points, frame.T_odom_body, stamp + frame.stamp - begin.stamp)

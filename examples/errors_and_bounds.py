@@ -1,4 +1,4 @@
-"""What a pose says of its own error, beside the error that it has: one sigma, protection level, truth.
+"""Stated and true errors of poses: one sigma and protection level beside the error.
 
 coview-stream demo && python examples/errors_and_bounds.py coview-demo/world errors.png
 """

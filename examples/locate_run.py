@@ -2,7 +2,7 @@
 
     coview-stream demo && python examples/locate_run.py coview-demo/world
 
-The directory holds base.laz, run/ and truth.tum, as the commands demo and simulate write them.
+The directory holds base.laz, run/ and truth.tum, written by the commands demo and simulate.
 """
 
 from __future__ import annotations

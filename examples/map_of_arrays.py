@@ -1,4 +1,4 @@
-"""A map of points that are in memory already, from a database or another program, with a reference system.
+"""A map from points in memory, as from a database or another program, with a reference system.
 
 coview-stream demo && python examples/map_of_arrays.py coview-demo/world site.coview
 """
@@ -16,7 +16,7 @@ from coview_stream import BaseMap, read_cloud
 def main(world: Path, site: Path) -> BaseMap:
     """Write the map and return it as it is read back."""
     cloud = read_cloud(world / "base.laz")
-    # float64: float32 is decimetres off at UTM's coordinates. Several arrays, or arrays and files, are one map, too.
+    # float64, as float32 is decimetres off at UTM coordinates. Several arrays, or arrays and files, also give one map.
     points = np.add(cloud.map_points(), [500_000.0, 5_400_000.0, 0.0])
     base_map = BaseMap.build(points, crs="EPSG:25832", learned=False)
     print(base_map.summary)  # extent, area, density, heights: the line to check

@@ -18,7 +18,7 @@ from coview_stream import BaseMap, Localizer, State
 from coview_stream.recordings import open_run
 
 TIMES = 10.0
-"""Circles are drawn so much larger: centimetres would not be seen."""
+"""Factor by which circles are enlarged, as centimetres would be invisible."""
 
 
 def main(world: Path, picture: Path) -> int:

@@ -3,7 +3,7 @@
     coview-stream simulate world --scene campus --sensor os64 --length 0
     python examples/single_scan.py world/base.laz world/run/frames/000000.pcd
 
-One scan has to bring the evidence alone that a drive collects from keyframe to keyframe.
+One scan alone has to provide the evidence that a drive collects over its keyframes.
 """
 
 from __future__ import annotations

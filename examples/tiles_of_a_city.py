@@ -1,4 +1,4 @@
-"""A map as a directory of tiles: built out of core, brought up to date with one changed survey, opened like a file.
+"""A map as a directory of tiles: built out of core, updated, and opened like a file.
 
 coview-stream demo && python examples/tiles_of_a_city.py coview-demo/world city
 """
@@ -29,7 +29,7 @@ def main(world: Path, directory: Path, workers: int = 2) -> BaseMap:
     return BaseMap.load(directory)
 
 
-if __name__ == "__main__":  # workers import this file: without this line they would begin anew
+if __name__ == "__main__":  # workers import this file; without this line they would start the build again
     if len(sys.argv) != 3:
         sys.exit(__doc__)
     main(Path(sys.argv[1]), Path(sys.argv[2]))

@@ -18,7 +18,7 @@ from coview_stream.report.export import export, trajectory_of
 
 def main(world: Path, folder: Path) -> list[Path]:
     """Write the files, and return them."""
-    # the simulated world has no place on Earth: it is put into zone 32 here
+    # the simulated world has no place on Earth, so it is moved to zone 32
     points = np.add(read_cloud(world / "base.laz").map_points(), [500_000.0, 5_400_000.0, 300.0])
     base_map = BaseMap.build(points, crs="EPSG:25832", learned=False)
     localizer = Localizer(base_map)

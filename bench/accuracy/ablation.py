@@ -1,4 +1,4 @@
-"""What each choice of the method is worth, group by group, on sites that separate.
+"""Value of each choice of the method, group by group, on sites that separate the choices.
 
 Every variant changes one choice. Choices of the search are judged at single keyframes, the others by the whole
 localizer, also on maps of other sites (``elsewhere``). Sites: an airborne-like map of 6 pulses per square metre,

@@ -119,7 +119,7 @@ class Chain:
         self._base_map, self._local_maps = base_map, LocalMaps(base_map, config.registration.source_range)
 
     def scan(self, query: SearchRequest) -> ObservedScan:
-        """Return what of a query is registered."""
+        """Return the part of a query that is registered."""
         points = prepare_scan(query.submap, query.position, self.config.registration)
         return ObservedScan.of(points, query.cloud, query.T_odom_body)
 

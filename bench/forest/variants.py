@@ -28,7 +28,7 @@ from coview_stream.localization.tracking.motion import Drift
 from coview_stream.localization.tracking.pose_graph import PoseGraph
 
 _COMPASS, _TILT = np.radians(5.0), np.radians(0.5)  # sigmas of the heading and tilt at the start
-_UNKNOWN = 100.0  # radians: sigma of what a fix says about the heading
+_UNKNOWN = 100.0  # radians: sigma of a fix's heading
 
 
 @dataclass(frozen=True)

@@ -82,7 +82,7 @@ def on_disk(world: Path) -> dict[str, Any]:
 
 @dataclass(frozen=True)
 class Drive:
-    """What a robot has seen up to now."""
+    """Frames that a robot has seen so far."""
 
     sensor: str
     travelled: float  # metres, by odometry

@@ -69,7 +69,7 @@ def _built() -> BaseMap:
 
 
 def _use(base_map: BaseMap) -> object:
-    """Do what a node does with a map: its summary, look-ups, a search, and two frames."""
+    """Use a map as a node does: summary, look-ups, a search, and two frames."""
     if base_map.learned is not None:
         base_map.learned.check()
     base_map.surveyed(np.zeros((1, 2)))

@@ -72,7 +72,7 @@ def remembered(file: Path, spec: dict[str, Any], make: Callable[[], Any], wait: 
     Only one of several processes computes it; without ``wait`` the others get a BlockingIOError meanwhile.
     """
     spec = json.loads(json.dumps(spec))
-    beside = file.parent.with_name(f"{file.parent.name}-{file.stem}.lock")  # what makes a world wants an empty folder
+    beside = file.parent.with_name(f"{file.parent.name}-{file.stem}.lock")  # making a world needs an empty folder
     with locked(beside, wait):
         if not file.is_file() or json.loads(file.read_text())["spec"] != spec:
             made = make()

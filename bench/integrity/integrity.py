@@ -119,7 +119,7 @@ def class_table(results: Sequence[Result]) -> str:
 
 
 def family_table(results: Sequence[Result]) -> str:
-    """Lay out what was found after how many metres, for each family and each real survey and run."""
+    """Lay out the outcomes by metres driven, for each family and each real survey and run."""
     lines = []
     rows_of = sorted({(list(FAMILIES).index(run["family"]), run.get("place", "")) for run in results})
     for number_of, place in rows_of:
@@ -214,7 +214,7 @@ _FOUND = ("key", "place", "outcome", "state", "metres", "risk", "searched")  # o
 
 
 def kept(file: Path, code: str) -> dict[str, Result]:
-    """Return what the runs of a file found, by key; nothing without a file, InputError if it is of other code."""
+    """Return the results in a file by key; nothing without a file, InputError if other code made it."""
     if not file.is_file():
         return {}
     with lzma.open(file, "rt") as lines:

@@ -66,7 +66,7 @@ def draw(kind: str, seed: int, changed: float) -> Scene:
 
 SIZE, SIZES = 180.0, {"boxes": 520.0, "avenue": 260.0}  # metres, the side of a site; of kinds that need more
 _DENSITY, _DENSITIES = 10.0, {"boxes": 6.0}  # pulses per square metre
-_STRIPS = {"boxes": 30.0, "avenue": 40.0}  # metres from a street, beyond which the map has only what is high
+_STRIPS = {"boxes": 30.0, "avenue": 40.0}  # metres from a street beyond which the map has only high objects
 _HIGH = 5.0  # metres
 _SCAN = 210  # random stream
 

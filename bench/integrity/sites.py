@@ -84,7 +84,7 @@ def stand(mesh: Mesh, site: Site, xy: Floats, yaw: float) -> Mesh:
 
 
 class Movables(NamedTuple):
-    """What may change: rows of trees, cars and poles, those of the survey first, then as many spare ones."""
+    """Objects that may change: rows of trees, cars and poles, first those of the survey, then equally many spares."""
 
     trees: Floats
     cars: Floats

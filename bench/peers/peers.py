@@ -316,7 +316,7 @@ def run_trial(peer: str, scene: str, count: int, map_file: Path, places_file: Pa
 
 def _asked(name: str, map_file: str, places_file: str, limit_s: float) -> Iterator[Row]:
     """Yield the seconds of a query with its answer, until an alarm ends this process."""
-    signal.alarm(math.ceil(10 * limit_s))  # for what a method prepares for the map
+    signal.alarm(math.ceil(10 * limit_s))  # for a method's preparation of the map
     found, site = pickle.loads(Path(places_file).read_bytes()), BaseMap.load(Path(map_file))
     method = PEERS[name](site)
     signal.alarm(math.ceil(limit_s))
