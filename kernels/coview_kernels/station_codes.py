@@ -234,6 +234,11 @@ class StationCodes:
         numbers = _projected(_spectra(stacked[None]), self.basis)[0]
         return CodedQuery(numbers, self.step, self.norm, self.sectors)
 
+    def query_of(self, station: int) -> CodedQuery:
+        """Return a station as a query: its surroundings in its own axes."""
+        parts = _unpack(self.codes[station]) * self.step
+        return CodedQuery((parts[:, 0] + 1j * parts[:, 1]).astype(np.complex64), self.step, self.norm, self.sectors)
+
     def best(self, query: CodedQuery) -> F32:
         """Return the greatest correlation (M,) with each station over 60 angles, which are all shifts of 60 sectors."""
         numbers, turn, unit = query.screen

@@ -177,6 +177,11 @@ def _mean_gaps(gaps: Floats, sigmas: Floats) -> Floats:
     return np.asarray(np.where(gaps > 0.0, np.log(-np.expm1(wrong)) - wrong, gaps))
 
 
+def odds_of(gaps: Floats, variances: Floats) -> Floats:
+    """Return the odds (N,) of places against another one that leads by log-ratios (N,) with these variances."""
+    return np.asarray(np.exp(-_mean_gaps(gaps, np.sqrt(variances))))
+
+
 def expected_by_chance(ratio: float, count: int) -> float:
     """Return the expected number of chance places, of ``count``, with a log-likelihood ratio of ``ratio`` or more."""
     return float(count * np.exp(-max(ratio, 0.0)))

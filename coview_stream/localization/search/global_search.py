@@ -26,6 +26,7 @@ from coview_stream.localization.search.scoring import BASIN_ANGLE, BASIN_DISTANC
 
 _ORDINARY = 20_000  # stations up to which the configured number of co-view hypotheses is enough
 _GUESSES = 12  # poses of a guess tried per keyframe
+_NAMED = 4  # places like the leader that the next keyframe looks at as well
 _STREET = 12.0  # metres from the leader: reach of the farthest hypothesis around it after its largest move
 
 
@@ -38,6 +39,7 @@ class Reading:
     scored: Scored  # the places
     leader: Hypothesis | None  # the first place, registered; None if that failed
     level: Pose | None  # (4, 4) the leader's T_map_odom, levelled by the newest frame alone; None without a leader
+    scorer: PlaceScorer  # of the places
     turn: Pose = field(default_factory=lambda: np.eye(4))  # (4, 4) rotated odometry frame <- odometry frame
 
     @property
@@ -117,6 +119,7 @@ class GlobalSearch:
         self._guesses = HintSchedule()
         self._scorer.clear()
         self._keyframes = 0
+        self._named: list[Hypothesis] = []  # by the map, as places like the leader
 
     def reset(self) -> None:
         """Forget all votes and observations, and the newest descriptors."""
@@ -132,16 +135,20 @@ class GlobalSearch:
         self._vote(request)  # eqs 1-9: descriptors, compared with all stations at all turns
         voted, ranks = self._propose()  # eq. 12: peaks of the consensus as T_map_odom
         guessed = self._guessed(request)
-        voted, ranks = [*voted, *guessed], [*ranks, *range(len(guessed))]
+        voted = [*voted, *guessed, *self._named]
+        ranks = [*ranks, *range(len(guessed)), *range(len(self._named))]
         hints = self._hints.due(request.hints)
         hypotheses, scan = [*voted, *hints], self._observed(request)
         scored = self._scorer.score(hypotheses, ranks, len(hints), scan, request.lean_prior)  # against chance
         leader = self._register(scored, scan, request)  # eq. 13, and the evidence there
-        reading = Reading(request, scan, scored, leader, self._level(leader, request))
+        reading = Reading(request, scan, scored, leader, self._level(leader, request), self._scorer)
         self._keyframes += 1
         if scored.error >= self.config.acceptance.risk:
             reading = self._leaning(reading, hypotheses, ranks, len(hints)) or reading
         self._note_hints(reading.scored, hints, request)
+        alike = self._alike(reading)
+        self._named = sorted(alike, key=lambda place: -place.probability)[:_NAMED]
+        reading = replace(reading, scored=reading.scored.beside(alike))
         result = self._decide(reading)
         if result.accepted is not None:
             self.clear()
@@ -167,6 +174,16 @@ class GlobalSearch:
         if result.accepted is not None:
             result = replace(result, accepted=result.accepted.after(reading.turn))
         return result
+
+    def _alike(self, reading: Reading) -> list[Hypothesis]:
+        """Return places that look like a probable leader's on the map, with their odds against it.
+
+        The votes of a scan may miss one: at the border, where the map shows half of the view, or where a site is flat.
+        """
+        if self.coview is None or reading.leader is None or reading.scored.error >= 0.5:
+            return []
+        places = self.coview.alike(reading.scored.places[0].T_map_odom, reading.request.position)
+        return reading.scorer.beside_leader(places, reading.scan) if len(places) else []
 
     def _level(self, leader: Hypothesis | None, request: SearchRequest) -> Pose | None:
         if leader is None:
@@ -201,7 +218,7 @@ class GlobalSearch:
         about_body = request.position
         turn = pose_from(R, about_body - R @ about_body)
         level = self._level(found, turned)
-        return Reading(turned, scan, scored.together_with(upright.scored), found, level, turn)
+        return Reading(turned, scan, scored.together_with(upright.scored), found, level, scorer, turn)
 
     def _begin(self, request: SearchRequest) -> None:
         """Restart with a request, or continue with its earlier keyframes, which is no other start."""

@@ -24,10 +24,11 @@ from coview_stream.descriptors.coview import Descriptor
 from coview_stream.geometry.arrays import Floats, Floats32, Int32s, Ints
 from coview_stream.geometry.rasters import argsmallest
 from coview_stream.geometry.transforms import Circle
-from coview_stream.localization.search.consensus import Consensus, Hypothesis
+from coview_stream.localization.search.consensus import Consensus, Hypothesis, yaw_of_shift
 
 _MIN_STATIONS, _SHARE = 2048, 32  # best stations whose shifts are compared: at least 2048, and one in 32
 _PER_STATION = 0.5  # candidates per such station
+_ALIKE = 24  # places that look most like the leader's surroundings: the map may hold rows of them
 _SQUARE = 6.0  # metres, all within 4.3 m of the middle; chosen between 4 and 6 by bench city
 _ORDINARY = 65_536  # largest number of stations that are all compared: 6 ms for one core
 _BLOCK = 8192  # stations whose exact spectra are computed at a time
@@ -102,6 +103,26 @@ class SearchStations:
     def __len__(self) -> int:
         """Return the number of stations K."""
         return len(self.grid)
+
+    def alike(self, position: Floats, rule: ConsensusConfig) -> Floats:
+        """Return transforms (K, 4, 4) that lead from a position (3,) of the map to places with similar surroundings.
+
+        The first is the place itself; none where there is no station.
+        """
+        own, codes = int(self.grid.at(position[None])[0]), self.index.codes
+        if own < 0:
+            return np.empty((0, 4, 4))
+        query = codes.query_of(own)
+        stations = argsmallest(-codes.best(query), _MIN_STATIONS)
+        scores = codes.all_shifts(query, stations)
+        row, shift = np.divmod(argsmallest(-scores.ravel(), _MIN_STATIONS), self.index.sectors)
+        at, yaw = self.grid.stations[stations[row]].astype(np.float64), yaw_of_shift(shift, self.index.sectors)
+        chosen = kernels.distinct_poses(at, yaw, 1 + _ALIKE, rule.distinct_distance, rule.distinct_yaw)
+        T = np.tile(np.eye(4), (len(chosen), 1, 1))
+        cos, sin = np.cos(yaw[chosen]), np.sin(yaw[chosen])
+        T[:, 0, 0], T[:, 0, 1], T[:, 1, 0], T[:, 1, 1] = cos, -sin, sin, cos
+        T[:, :3, 3] = at[chosen] - T[:, :3, :3] @ self.grid.stations[own].astype(np.float64)
+        return T
 
     def on_the_map(self, places: Sequence[Hypothesis], vote: CoViewVote, keyframes: int) -> list[Hypothesis]:
         """Return places with their stations' numbers in the map, each on the best station of its square.
@@ -231,6 +252,10 @@ class StationConsensus:
         vote = CoViewVote(centre, compared.index, query)
         self._voted = compared, consensus, vote
         consensus.vote(vote)
+
+    def alike(self, position: Floats) -> Floats:
+        """Return what :meth:`SearchStations.alike` does; none before the first vote."""
+        return np.empty((0, 4, 4)) if self._voted is None else self._voted[0].alike(position, self.config)
 
     def hypotheses(self) -> list[Hypothesis]:
         """Return the best spatially distinct hypotheses, best first; none before the first vote."""

@@ -30,6 +30,7 @@ from coview_stream.localization.evidence.background import (
 from coview_stream.localization.evidence.likelihood import (
     expected_by_chance,
     log_likelihood_ratios,
+    odds_of,
     posterior,
     ratio_variances,
 )
@@ -101,6 +102,21 @@ class Scored:
         return replace(
             self, places=places, error=wrong * share, none=share, second=None if second is None else places[second]
         )
+
+    def beside(self, others: list[Hypothesis]) -> Scored:
+        """Add places whose ``probability`` is their odds against the first place."""
+        if not others:
+            return self
+        share = 1.0 / (1.0 + self.places[0].probability * sum(place.probability for place in others))
+        odds = self.places[0].probability * share
+        places = [replace(place, probability=share * place.probability) for place in self.places]
+        added = [replace(place, probability=odds * place.probability) for place in others]
+        second = next((k for k, place in enumerate(self.places) if place is self.second), None)
+        rivals = added if second is None else [*added, places[second]]
+        return replace(
+            self, places=[*places, *added], error=1.0 - share * (1.0 - self.error), none=share * self.none,
+            second=max(rivals, key=lambda place: place.probability),
+        )  # fmt: skip
 
     def doubted(self, moved: MovedPart) -> Scored:
         """Add the error by a moved part, as either part may be the unmoved one."""
@@ -229,6 +245,33 @@ class PlaceScorer:
         by_chance = expected_by_chance(places[0].ratio, len(first))
         return Scored(rivals, places, chances.error(~elsewhere), chances.none, by_chance, second)
 
+    def beside_leader(self, T_map_odom: Floats, scan: ObservedScan) -> list[Hypothesis]:
+        """Return those of further places (H, 4, 4) that are not scored yet, with their odds against the leader.
+
+        They have the leader's prior probability, and the background of the newest keyframe.
+        """
+        leader, layers = self._followed.observed[:1], self._base_map.field
+        known = scan.poses(np.array([place.T_map_odom for place in self._followed.hypotheses]))
+        part = scan.many.look_up(layers, scan.few.look_up(layers, scan.poses(T_map_odom), Move.FAR).poses, Move.NEAR)
+        new = [
+            group[0] for group in _places(part.poses, part.scores)
+            if _apart(known, part.poses[group[0]], SAME_DISTANCE, SAME_ANGLE).all()
+            and _apart(part.poses[group[:1]], known[0], BASIN_DISTANCE, BASIN_ANGLE).all()
+        ]  # fmt: skip
+        if not new:
+            return []
+        at = scan.transforms(part.poses[new])
+        observed = self._look_back(at)
+        observed[:, -1] = np.column_stack([part.shares[new], observe_around(layers, scan.few, part.poses[new])])
+        shares = np.concatenate([leader, observed]).mean(axis=1)
+        ratios = log_likelihood_ratios(shares, self._background)
+        variances = self._left * ratio_variances(shares, self._background)
+        odds = odds_of(ratios[0] - ratios[1:], variances[0] + variances[1:])
+        return [
+            Hypothesis(T, score=float(score), ratio=float(ratio), probability=float(each))
+            for T, score, ratio, each in zip(at, part.scores[new], ratios[1:], odds, strict=True)
+        ]
+
     def _thin_out(self) -> None:
         """Drop the keyframe closest to its neighbours if there are too many; the first and the newest stay."""
         if len(self._scans) <= _KEYFRAMES:
@@ -349,7 +392,8 @@ class PlaceScorer:
             # places around the leader share its explanation
             chance, distant = (_apart(at, leader, _CHANCE_DISTANCE, _CHANCE_ANGLE) for at in (places, poses))
             self._scatter[-1] = scatter(observed.shares[first][chance])
-        return ratios, float(left[:3].mean()) * ratio_variances(mean, background)  # shrinks like the scatter
+        self._background, self._left = background, float(left[:3].mean())
+        return ratios, self._left * ratio_variances(mean, background)  # shrinks like the scatter
 
     def _over_time(self, observed: _Observed, first: Ints, scan: ObservedScan) -> tuple[Ints, Floats32]:
         """Return a sample (N,) of the places, and the observations (N, W, 15) of all keyframes there."""
