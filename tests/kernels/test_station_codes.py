@@ -68,6 +68,17 @@ def test_single_pairs_and_all_shifts_agree(known):
     np.testing.assert_allclose(codes.at(query, station, shift), expected, atol=2e-5)
 
 
+def test_a_station_asks_for_those_like_it(known):
+    descriptors, _ = scene()
+    for each in descriptors:
+        each[30] = np.roll(each[70], 11, axis=1)
+    codes = StationCodes.of(descriptors)
+    for query in (codes.query_of(70), codes.query(stacked([each[70] for each in descriptors]))):
+        best = codes.best(query)
+        assert set(best.argsort()[-2:]) == {30, 70}
+        assert codes.all_shifts(query, [70, 30]).argmax(axis=1).tolist() == [0, S - 11]
+
+
 def test_best_is_the_maximum_over_the_shifts(known):
     codes, columns, _ = known
     query = codes.query(columns)

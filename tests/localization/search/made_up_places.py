@@ -33,6 +33,9 @@ class Votes:
     def hypotheses(self):
         return self.name(self.consensus.hypotheses())
 
+    def alike(self, position):
+        return self.consensus.alike(position)
+
     def clear(self):
         self.consensus.clear()
 

@@ -10,7 +10,7 @@ from se3 import exp_se3
 
 from coview_stream.basemap.basemap import BaseMap
 from coview_stream.config import AcceptanceConfig, DescriptorConfig, LocalizerConfig, RegistrationConfig
-from coview_stream.geometry.transforms import exp_so3, inverse, pose_from, rot_z, tilt_of
+from coview_stream.geometry.transforms import exp_so3, inverse, pose_from, rot_z, tilt_of, to_local
 from coview_stream.localization.calibration.calibration import Calibration, RawScan
 from coview_stream.localization.evidence.observation import Evidence
 from coview_stream.localization.localizer import Localizer
@@ -147,6 +147,31 @@ def test_identical_places_never_fix(twin_map, world_drive):
         assert 0.3 < result.evidence.confidence < 0.9
         # neither is a chance place: each explains all
         assert result.evidence.by_chance < search.config.acceptance.risk
+
+
+def in_the_twin(base_map):
+    """Choose the places near the second of two copies."""
+    return lambda places: [place for place in places if place.T_map_odom[0, 3] + base_map.origin[0] > 0.5 * TWIN]
+
+
+def test_twin_that_no_vote_names_is_found_on_the_map(twin_map, world_drive):
+    """The votes of a scan may miss a place, at the border or where the site is flat."""
+    search = searching(twin_map)
+    name_instead(search, in_the_twin(twin_map))
+    for request in run_of(world_drive, 3):
+        result = search.update(request)
+        assert result.accepted is None
+        assert result.evidence.reason.startswith("two places fit")
+
+
+def test_better_place_that_the_map_names_leads_at_the_next_keyframe(map_points, world_drive):
+    copy = map_points[(map_points[:, 1] < 8.0) | (map_points[:, 2] < 1.0)] + np.array([TWIN, 0, 0])  # a part is gone
+    base_map = BaseMap.build(np.concatenate([map_points, copy]).astype(np.float32), radius=30.0)
+    search = searching(base_map)
+    name_instead(search, in_the_twin(base_map))
+    first, second = (search.update(request) for request in run_of(world_drive, 2))
+    assert first.accepted is None
+    assert off(to_local(second.leader, -np.asarray(base_map.origin))) < 0.3
 
 
 def test_scan_of_another_world_is_never_accepted(search, elsewhere):

@@ -13,7 +13,7 @@ from coview_stream.geometry.transforms import inverse, pose_from, rot_z, rotatio
 from coview_stream.localization.evidence.observation import ObservedScan
 from coview_stream.localization.registration.clouds import prepare_scan
 from coview_stream.localization.search.consensus import Hypothesis
-from coview_stream.localization.search.scoring import PlaceScorer
+from coview_stream.localization.search.scoring import PlaceScorer, Rivals, Scored
 
 ODOM = pose_from(rot_z(-0.7), [12.0, 40.0, 3.0])  # map <- odometry
 
@@ -205,3 +205,14 @@ def test_two_readings_of_a_scan_are_weighed_by_their_prior(world_map, world_driv
     both = leaning.together_with(far)
     others = sum(place.probability for place in both.places[1:])
     assert both.error - others == pytest.approx(0.02, rel=0.2)
+
+
+def test_places_that_the_map_names_share_the_probability_by_their_odds():
+    T = np.eye(4)
+    first, other = Hypothesis(T, 1, probability=0.6), Hypothesis(T, 2, probability=0.3)
+    before = Scored(Rivals(), [first, other], error=0.4, none=0.1, second=other)
+    after = before.beside([Hypothesis(T, probability=0.5), Hypothesis(T, probability=2.0)])
+    assert [place.probability for place in after.places] == pytest.approx([0.24, 0.12, 0.12, 0.48])
+    assert (after.error, after.none) == pytest.approx((0.76, 0.04))
+    assert after.second is after.places[-1]
+    assert before.beside([]) is before
