@@ -117,7 +117,7 @@ def beyond_alert_limit(track: Track, error: Errors, driven: Floats) -> list[tupl
     beyond = track.tracking & ((error.metres > ALERT_METRES) | (error.degrees > ALERT_DEGREES))
     edges = np.diff(np.r_[False, beyond, False].astype(int))
     out = []
-    for begin, end in zip(np.flatnonzero(edges == 1), np.flatnonzero(edges == -1), strict=True):
+    for begin, end in zip(*(np.flatnonzero(edges == sign).tolist() for sign in (1, -1)), strict=True):
         last = min(end, len(driven) - 1)  # where it is withdrawn, or the drive's end
         out.append((float(track.stamps[last] - track.stamps[begin]), float(driven[last] - driven[begin])))
     return out
