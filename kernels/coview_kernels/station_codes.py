@@ -281,6 +281,17 @@ class StationCodes:
         angle = (2.0 * np.pi / self.sectors) * _frequencies()[:, :, None] * np.arange(self.sectors)
         return np.stack([np.cos(angle), -np.sin(angle)], axis=1).reshape(4 * _LANES, -1).astype(np.float32)
 
+    @cached_property
+    def lengths(self) -> F32:
+        """(M,) norms of the stations' numbers."""
+        norms = np.empty(len(self), dtype=np.float32)
+        for start in range(0, len(self), _BATCH):
+            part = slice(start, start + _BATCH)
+            norms[part] = np.linalg.norm(
+                (_unpack(self.codes[part]) * self.step).reshape(-1, 2 * _ROWS * _LANES), axis=1
+            )
+        return np.maximum(norms, np.float32(1e-6))
+
     def _ready(self, launch: int) -> Callable[[], bool]:
         return lambda: "_kernels" in vars(self) and self._kernels.launches[launch].ready()
 

@@ -77,6 +77,7 @@ def test_a_station_asks_for_those_like_it(known):
         best = codes.best(query)
         assert set(best.argsort()[-2:]) == {30, 70}
         assert codes.all_shifts(query, [70, 30]).argmax(axis=1).tolist() == [0, S - 11]
+    assert codes.lengths[70] == pytest.approx(np.linalg.norm(codes.query_of(70).numbers), rel=1e-5)
 
 
 def test_best_is_the_maximum_over_the_shifts(known):

@@ -120,6 +120,7 @@ class GlobalSearch:
         self._scorer.clear()
         self._keyframes = 0
         self._named: list[Hypothesis] = []  # by the map, as places like the leader
+        self._rank = 0  # of that leader in its votes, and so of these places
 
     def reset(self) -> None:
         """Forget all votes and observations, and the newest descriptors."""
@@ -136,7 +137,7 @@ class GlobalSearch:
         voted, ranks = self._propose()  # eq. 12: peaks of the consensus as T_map_odom
         guessed = self._guessed(request)
         voted = [*voted, *guessed, *self._named]
-        ranks = [*ranks, *range(len(guessed)), *range(len(self._named))]
+        ranks = [*ranks, *range(len(guessed)), *[self._rank] * len(self._named)]
         hints = self._hints.due(request.hints)
         hypotheses, scan = [*voted, *hints], self._observed(request)
         scored = self._scorer.score(hypotheses, ranks, len(hints), scan, request.lean_prior)  # against chance
@@ -148,6 +149,7 @@ class GlobalSearch:
         self._note_hints(reading.scored, hints, request)
         alike = self._alike(reading)
         self._named = sorted(alike, key=lambda place: -place.probability)[:_NAMED]
+        self._rank = int(reading.scorer.followed.votes[0]) if alike else 0
         reading = replace(reading, scored=reading.scored.beside(alike))
         result = self._decide(reading)
         if result.accepted is not None:
@@ -178,11 +180,15 @@ class GlobalSearch:
     def _alike(self, reading: Reading) -> list[Hypothesis]:
         """Return places that look like a probable leader's on the map, with their odds against it.
 
-        The votes of a scan may miss one: at the border, where the map shows half of the view, or where a site is flat.
+        The votes of a scan may miss one: near the border, where the map shows a part of the view, or on a flat site.
         """
-        if self.coview is None or reading.leader is None or reading.scored.error >= 0.5:
+        scored, leader = reading.scored, reading.leader
+        if self.coview is None or not scored.places:
             return []
-        places = self.coview.alike(reading.scored.places[0].T_map_odom, reading.request.position)
+        street = [] if leader is None else self._along_street(scored, leader, reading.request)
+        if scored.error - sum(place.probability for place in street) >= 0.5:
+            return []
+        places = self.coview.alike(scored.places[0].T_map_odom)
         return reading.scorer.beside_leader(places, reading.scan) if len(places) else []
 
     def _level(self, leader: Hypothesis | None, request: SearchRequest) -> Pose | None:
@@ -277,26 +283,32 @@ class GlobalSearch:
         The field hardly separates poses a few metres along a street; points against surfaces do. Done only where it may
         lead to an acceptance.
         """
-
-        def around(place: Hypothesis, distance: float) -> bool:
-            return same_place(place.T_map_odom, leader.T_map_odom, request, distance, BASIN_ANGLE)
-
         risk, error = self.config.acceptance.risk, scored.error
-        first = scored.places[0]
-        near = [
-            place for place in scored.places[1:]
-            if around(place, _STREET) and not around(place, BASIN_DISTANCE)
-            and not same_place(place.T_map_odom, first.T_map_odom, request, BASIN_DISTANCE, BASIN_ANGLE)
-        ]  # fmt: skip
+        near = self._along_street(scored, leader, request)
         for k, place in enumerate(near[:_GUESSES]):
             if error < risk or error - sum(other.probability for other in near[k:]) >= risk:
                 break
             found = register_place(
                 place, scan, self.base_map, self.config, self._local_maps, widest=self.config.registration.search[0]
             )
-            if found is not None and around(found, BASIN_DISTANCE):
+            if found is not None and same_place(
+                found.T_map_odom, leader.T_map_odom, request, BASIN_DISTANCE, BASIN_ANGLE
+            ):
                 error -= place.probability
         return replace(scored, error=max(error, scored.none))
+
+    def _along_street(self, scored: Scored, leader: Hypothesis, request: SearchRequest) -> list[Hypothesis]:
+        """Return the places within 12 m of the leader, at its heading, that are not its own; most probable first."""
+
+        def around(place: Hypothesis, of: Hypothesis, distance: float) -> bool:
+            return same_place(place.T_map_odom, of.T_map_odom, request, distance, BASIN_ANGLE)
+
+        near = [
+            place for place in scored.places[1:]
+            if around(place, leader, _STREET) and not around(place, leader, BASIN_DISTANCE)
+            and not around(place, scored.places[0], BASIN_DISTANCE)
+        ]  # fmt: skip
+        return sorted(near, key=lambda place: -place.probability)
 
     def _note_hints(self, scored: Scored, hints: list[Hypothesis], request: SearchRequest) -> None:
         """Record whether the keyframe refuted the hints that it tried."""

@@ -10,7 +10,7 @@ from coview_stream.basemap.basemap import BaseMap
 from coview_stream.config import Channel, LocalizerConfig
 from coview_stream.descriptors.coview import Descriptor, describe, on_ground
 from coview_stream.geometry.arrays import Floats
-from coview_stream.geometry.transforms import Pose, transform
+from coview_stream.geometry.transforms import Pose
 from coview_stream.localization.search.consensus import Hypothesis
 from coview_stream.localization.search.request import SearchRequest
 from coview_stream.localization.search.retrieval import Retrieval, StationConsensus
@@ -96,9 +96,9 @@ class CoViewRecognizer:
         """Return the consensus' peaks."""
         return self.consensus.hypotheses()
 
-    def alike(self, T_map_odom: Pose, position: Floats) -> Floats:
-        """Return ``T_map_odom`` (K, 4, 4) of places that look like one on the map, for a robot's ``position`` (3,)."""
-        return self.consensus.alike(transform(T_map_odom, position[None])[0]) @ T_map_odom
+    def alike(self, T_map_odom: Pose) -> Floats:
+        """Return ``T_map_odom`` (K, 4, 4) of the places that look most like one on the map."""
+        return self.consensus.alike(T_map_odom)
 
     def clear(self) -> None:
         """Forget all votes."""

@@ -15,7 +15,7 @@ import numpy as np
 import numpy.typing as npt
 
 import coview_kernels as kernels
-from coview_kernels import StationCodes
+from coview_kernels import CodedQuery, StationCodes
 from coview_stream.basemap.basemap import BaseMap
 from coview_stream.basemap.station_index import StationIndex
 from coview_stream.basemap.stations import LEVEL_GAP, StationGrid
@@ -23,12 +23,12 @@ from coview_stream.config import Channel, ConsensusConfig
 from coview_stream.descriptors.coview import Descriptor
 from coview_stream.geometry.arrays import Floats, Floats32, Int32s, Ints
 from coview_stream.geometry.rasters import argsmallest
-from coview_stream.geometry.transforms import Circle
+from coview_stream.geometry.transforms import Circle, Pose, transform
 from coview_stream.localization.search.consensus import Consensus, Hypothesis, yaw_of_shift
 
 _MIN_STATIONS, _SHARE = 2048, 32  # best stations whose shifts are compared: at least 2048, and one in 32
 _PER_STATION = 0.5  # candidates per such station
-_ALIKE = 24  # places that look most like the leader's surroundings: the map may hold rows of them
+_ALIKE = 16  # places that look most like the leader's surroundings: the map may hold rows of them
 _SQUARE = 6.0  # metres, all within 4.3 m of the middle; chosen between 4 and 6 by bench city
 _ORDINARY = 65_536  # largest number of stations that are all compared: 6 ms for one core
 _BLOCK = 8192  # stations whose exact spectra are computed at a time
@@ -107,21 +107,24 @@ class SearchStations:
     def alike(self, position: Floats, rule: ConsensusConfig) -> Floats:
         """Return transforms (K, 4, 4) that lead from a position (3,) of the map to places with similar surroundings.
 
-        The first is the place itself; none where there is no station.
+        Surroundings are compared by the direction of their codes, not by their sizes: near the border half is missing.
         """
-        own, codes = int(self.grid.at(position[None])[0]), self.index.codes
-        if own < 0:
-            return np.empty((0, 4, 4))
-        query = codes.query_of(own)
-        stations = argsmallest(-codes.best(query), _MIN_STATIONS)
-        scores = codes.all_shifts(query, stations)
+        codes, every = self.index.codes, self.grid.stations
+        if self.squares is not None:
+            codes, every = self.squares.codes, self.squares.stations
+        own = int(np.square(every - position.astype(np.float32)).sum(axis=1).argmin())
+        query, compared = codes.query_of(own), self.index.codes
+        stations = argsmallest(-compared.best(query) / compared.lengths, _MIN_STATIONS)
+        scores = compared.all_shifts(query, stations) / compared.lengths[stations, None]
         row, shift = np.divmod(argsmallest(-scores.ravel(), _MIN_STATIONS), self.index.sectors)
         at, yaw = self.grid.stations[stations[row]].astype(np.float64), yaw_of_shift(shift, self.index.sectors)
         chosen = kernels.distinct_poses(at, yaw, 1 + _ALIKE, rule.distinct_distance, rule.distinct_yaw)
+        at, yaw = at[chosen], yaw[chosen]
+        if self.squares is not None:
+            at = every[self.squares.best(query, stations[row[chosen]], shift[chosen])].astype(np.float64)
         T = np.tile(np.eye(4), (len(chosen), 1, 1))
-        cos, sin = np.cos(yaw[chosen]), np.sin(yaw[chosen])
-        T[:, 0, 0], T[:, 0, 1], T[:, 1, 0], T[:, 1, 1] = cos, -sin, sin, cos
-        T[:, :3, 3] = at[chosen] - T[:, :3, :3] @ self.grid.stations[own].astype(np.float64)
+        T[:, 0, 0], T[:, 0, 1], T[:, 1, 0], T[:, 1, 1] = np.cos(yaw), -np.sin(yaw), np.sin(yaw), np.cos(yaw)
+        T[:, :3, 3] = at - T[:, :3, :3] @ every[own].astype(np.float64)
         return T
 
     def on_the_map(self, places: Sequence[Hypothesis], vote: CoViewVote, keyframes: int) -> list[Hypothesis]:
@@ -145,6 +148,13 @@ class _Squares:
     members: Int32s  # (K, n) station numbers by square, -1 for none
     codes: StationCodes  # of all stations of the map
     stations: Floats32  # (M, 3) of the map
+
+    def best(self, query: CodedQuery, squares: Ints, shifts: Ints) -> Ints:
+        """Return the station (K,) of each square that is most like a query at a shift, by the first tier."""
+        members = self.members[squares].astype(np.int64)
+        scores = self.codes.at(query, members.ravel(), np.repeat(shifts, members.shape[1])).reshape(members.shape)
+        best = np.where(members < 0, -np.inf, scores).argmax(axis=1)[:, None]
+        return np.take_along_axis(members, best, axis=1)[:, 0]
 
     def refined(self, places: Sequence[Hypothesis], vote: CoViewVote, keyframes: int) -> list[Hypothesis]:
         """Return the places with the newest keyframe on the best station of each square, best first."""
@@ -253,9 +263,12 @@ class StationConsensus:
         self._voted = compared, consensus, vote
         consensus.vote(vote)
 
-    def alike(self, position: Floats) -> Floats:
-        """Return what :meth:`SearchStations.alike` does; none before the first vote."""
-        return np.empty((0, 4, 4)) if self._voted is None else self._voted[0].alike(position, self.config)
+    def alike(self, T_map_odom: Pose) -> Floats:
+        """Return ``T_map_odom`` (K, 4, 4) of the places that look most like one on the map; none without votes."""
+        if self._voted is None:
+            return np.empty((0, 4, 4))
+        compared, _, newest = self._voted
+        return compared.alike(transform(T_map_odom, newest.centre[None])[0], self.config) @ T_map_odom
 
     def hypotheses(self) -> list[Hypothesis]:
         """Return the best spatially distinct hypotheses, best first; none before the first vote."""

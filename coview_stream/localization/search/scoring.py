@@ -74,7 +74,7 @@ class Scored:
     """Scores of a keyframe's hypotheses."""
 
     rivals: Rivals  # all places
-    places: list[Hypothesis]  # followed places, most probable first
+    places: list[Hypothesis]  # followed places, most probable first; then those that only the map names
     error: float = 1.0  # probability that the robot is not at the first place
     none: float = 1.0  # probability that it is at no place of the map
     by_chance: float = np.inf  # expected number of chance places as good as the first
@@ -107,14 +107,14 @@ class Scored:
         """Add places whose ``probability`` is their odds against the first place."""
         if not others:
             return self
-        share = 1.0 / (1.0 + self.places[0].probability * sum(place.probability for place in others))
-        odds = self.places[0].probability * share
+        right = 1.0 - self.error  # of all poses around the first place, and of both readings
+        share = 1.0 / (1.0 + right * sum(place.probability for place in others))
         places = [replace(place, probability=share * place.probability) for place in self.places]
-        added = [replace(place, probability=odds * place.probability) for place in others]
+        added = [replace(place, probability=right * share * place.probability) for place in others]
         second = next((k for k, place in enumerate(self.places) if place is self.second), None)
         rivals = added if second is None else [*added, places[second]]
         return replace(
-            self, places=[*places, *added], error=1.0 - share * (1.0 - self.error), none=share * self.none,
+            self, places=[*places, *added], error=1.0 - share * right, none=share * self.none,
             second=max(rivals, key=lambda place: place.probability),
         )  # fmt: skip
 
@@ -261,8 +261,8 @@ class PlaceScorer:
         if not new:
             return []
         at = scan.transforms(part.poses[new])
-        observed = self._look_back(at)
-        observed[:, -1] = np.column_stack([part.shares[new], observe_around(layers, scan.few, part.poses[new])])
+        newest = np.column_stack([part.shares[new], observe_around(layers, scan.few, part.poses[new])])
+        observed = np.concatenate([self._look_back(at, self._scans[:-1]), newest[:, None]], axis=1)
         shares = np.concatenate([leader, observed]).mean(axis=1)
         ratios = log_likelihood_ratios(shares, self._background)
         variances = self._left * ratio_variances(shares, self._background)
@@ -340,15 +340,15 @@ class PlaceScorer:
             # a pose refined by more keyframes is better: the best places are looked up again from there
             anew = row < min(_KEPT, count)
             history[~anew] = before.observed[row[~anew]]
-            history[anew] = self._look_back(T[newest[anew]])
+            history[anew] = self._look_back(T[newest[anew]], self._scans)
         shares = np.concatenate([history, observed.shares[newest][:, None]], axis=1)
         return Followed([place for _, place in chosen], votes, shares, newest)
 
-    def _look_back(self, T_map_odom: Floats) -> Floats32:
-        """Return the earlier keyframes' observations (P, W, 15) at new places, corrected for drift."""
-        out = np.empty((len(T_map_odom), len(self._scans), NEARBY_VARIANCE.stop), dtype=np.float32)
-        for k in reversed(range(len(self._scans))):
-            scan = self._scans[k]
+    def _look_back(self, T_map_odom: Floats, scans: Sequence[ObservedScan]) -> Floats32:
+        """Return observations (P, W, 15) of earlier keyframes, oldest first, at new places, corrected for drift."""
+        out = np.empty((len(T_map_odom), len(scans), NEARBY_VARIANCE.stop), dtype=np.float32)
+        for k in reversed(range(len(scans))):
+            scan = scans[k]
             observed = scan.few.look_up(self._base_map.field, scan.poses(T_map_odom), Move.NEAR)
             around = observe_around(self._base_map.field, scan.few, observed.poses)
             out[:, k], T_map_odom = np.column_stack([observed.shares, around]), scan.transforms(observed.poses)
@@ -398,7 +398,7 @@ class PlaceScorer:
     def _over_time(self, observed: _Observed, first: Ints, scan: ObservedScan) -> tuple[Ints, Floats32]:
         """Return a sample (N,) of the places, and the observations (N, W, 15) of all keyframes there."""
         sample = np.linspace(0, len(first) - 1, min(len(first), _CHANCE)).astype(np.int64)
-        history = self._look_back(scan.transforms(observed.poses[first[sample]]))
+        history = self._look_back(scan.transforms(observed.poses[first[sample]]), self._scans)
         return sample, np.concatenate([history, observed.shares[first[sample]][:, None]], axis=1)
 
 

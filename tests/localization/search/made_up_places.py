@@ -33,8 +33,8 @@ class Votes:
     def hypotheses(self):
         return self.name(self.consensus.hypotheses())
 
-    def alike(self, position):
-        return self.consensus.alike(position)
+    def alike(self, T_map_odom):
+        return self.consensus.alike(T_map_odom)
 
     def clear(self):
         self.consensus.clear()

@@ -216,3 +216,5 @@ def test_places_that_the_map_names_share_the_probability_by_their_odds():
     assert (after.error, after.none) == pytest.approx((0.76, 0.04))
     assert after.second is after.places[-1]
     assert before.beside([]) is before
+    around = replace(before, error=0.2)  # the second pose is of the same place, or of the other reading
+    assert around.beside([Hypothesis(T, probability=1.0)]).error == pytest.approx(1.0 - 0.8 / 1.8)
