@@ -6,6 +6,7 @@ Only the circle of a guess is trusted: nothing outside is searched.
 from __future__ import annotations
 
 import math
+import numbers
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
@@ -68,15 +69,16 @@ class PlaceGuess:
     end: float = math.inf
 
     def __post_init__(self) -> None:
-        numbers = (self.x, self.y, 0.0 if self.yaw is None else self.yaw)
-        plain = all(isinstance(number, float | int) and not isinstance(number, bool) for number in numbers)
-        require(plain and bool(np.isfinite(numbers).all()), self, "x", "x, y and yaw as finite numbers")
+        for name in ("x", "y", "yaw", "distance", "angle", "within"):
+            value = getattr(self, name)
+            if value is not None or name not in ("yaw", "within"):
+                plain = isinstance(value, numbers.Real) and not isinstance(value, bool)
+                require(plain and -math.inf < value < math.inf, self, name, "a finite number")
         require(max(abs(self.x), abs(self.y)) < MAX_COORDINATE, self, "x", "map coordinates in metres")
         require(0.0 < self.distance <= MAX_DISTANCE, self, "distance", f"above 0, at most {MAX_DISTANCE:g} m")
         require(0.0 <= self.angle <= np.pi, self, "angle", "0 to pi radians")
         if self.within is not None:
-            plain = isinstance(self.within, float | int) and not isinstance(self.within, bool)
-            require(plain and MIN_WITHIN <= self.within < MAX_COORDINATE, self, "within", f"{MIN_WITHIN:g} m or more")
+            require(MIN_WITHIN <= self.within < MAX_COORDINATE, self, "within", f"{MIN_WITHIN:g} m or more")
 
     def poses(self) -> Floats:
         """Return (K, 3) x, y and yaw to try, nearest to the guess first."""

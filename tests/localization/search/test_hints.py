@@ -250,7 +250,19 @@ def test_guess_without_heading_tries_them_all():
 
 @pytest.mark.parametrize(
     "fields",
-    [{"x": float("nan")}, {"x": "1"}, {"x": True}, {"y": 1e9}, {"distance": 0.0}, {"distance": 100.0}, {"yaw": np.inf}],
+    [
+        {"x": float("nan")},
+        {"x": "1"},
+        {"x": True},
+        {"y": 1e9},
+        {"distance": 0.0},
+        {"distance": 100.0},
+        {"yaw": np.inf},
+        {"distance": "5"},
+        {"angle": None},
+        {"within": "60"},
+        {"x": 10**400},
+    ],
 )
 def test_impossible_guesses_are_refused(fields):
     with pytest.raises(ConfigError):
