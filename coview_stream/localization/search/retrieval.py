@@ -117,11 +117,14 @@ class SearchStations:
         stations = argsmallest(-compared.best(query) / compared.lengths, _MIN_STATIONS)
         scores = compared.all_shifts(query, stations) / compared.lengths[stations, None]
         row, shift = np.divmod(argsmallest(-scores.ravel(), _MIN_STATIONS), self.index.sectors)
-        at, yaw = self.grid.stations[stations[row]].astype(np.float64), yaw_of_shift(shift, self.index.sectors)
-        chosen = kernels.distinct_poses(at, yaw, 1 + _ALIKE, rule.distinct_distance, rule.distinct_yaw)
-        at, yaw = at[chosen], yaw[chosen]
-        if self.squares is not None:
-            at = every[self.squares.best(query, stations[row[chosen]], shift[chosen])].astype(np.float64)
+        found = stations[row]
+        if self.squares is not None:  # the middle of a square may be metres off
+            found, scores = self.squares.best(query, found, shift)
+            order = np.argsort(-scores / compared.lengths[stations[row]], kind="stable")
+            found, shift = found[order], shift[order]
+        yaw = yaw_of_shift(shift, self.index.sectors)
+        chosen = kernels.distinct_poses(every[found], yaw, 1 + _ALIKE, rule.distinct_distance, rule.distinct_yaw)
+        at, yaw = every[found[chosen]].astype(np.float64), yaw[chosen]
         T = np.tile(np.eye(4), (len(chosen), 1, 1))
         T[:, 0, 0], T[:, 0, 1], T[:, 1, 0], T[:, 1, 1] = np.cos(yaw), -np.sin(yaw), np.sin(yaw), np.cos(yaw)
         T[:, :3, 3] = at - T[:, :3, :3] @ every[own].astype(np.float64)
@@ -149,12 +152,13 @@ class _Squares:
     codes: StationCodes  # of all stations of the map
     stations: Floats32  # (M, 3) of the map
 
-    def best(self, query: CodedQuery, squares: Ints, shifts: Ints) -> Ints:
-        """Return the station (K,) of each square that is most like a query at a shift, by the first tier."""
+    def best(self, query: CodedQuery, squares: Ints, shifts: Ints) -> tuple[Ints, Floats32]:
+        """Return the station (K,) of each square that is most like a query at a shift, and its correlation."""
         members = self.members[squares].astype(np.int64)
         scores = self.codes.at(query, members.ravel(), np.repeat(shifts, members.shape[1])).reshape(members.shape)
-        best = np.where(members < 0, -np.inf, scores).argmax(axis=1)[:, None]
-        return np.take_along_axis(members, best, axis=1)[:, 0]
+        scores[members < 0] = -np.inf
+        best = scores.argmax(axis=1)[:, None]
+        return np.take_along_axis(members, best, axis=1)[:, 0], np.take_along_axis(scores, best, axis=1)[:, 0]
 
     def refined(self, places: Sequence[Hypothesis], vote: CoViewVote, keyframes: int) -> list[Hypothesis]:
         """Return the places with the newest keyframe on the best station of each square, best first."""

@@ -7,11 +7,12 @@ import pytest
 from trackers import assert_usual, follow
 
 from bench.accuracy.choices import TableVote
+from coview_stream.basemap.basemap import BaseMap
 from coview_stream.basemap.station_index import StationIndex
 from coview_stream.basemap.stations import StationGrid
-from coview_stream.config import DescriptorConfig
+from coview_stream.config import ConsensusConfig, DescriptorConfig
 from coview_stream.errors import InputError
-from coview_stream.geometry.transforms import Circle, pose_from
+from coview_stream.geometry.transforms import Circle, pose_from, rot_z, transform, yaw_of
 from coview_stream.localization.localizer import Localizer
 from coview_stream.localization.registration.clouds import LocalMaps
 from coview_stream.localization.search import retrieval
@@ -144,6 +145,28 @@ def test_every_station_is_in_one_square_and_its_middle_stands_for_it(few_are_man
         centre = (np.floor(inside[0] / 6.0) + 0.5) * 6.0
         nearest = np.abs(inside - centre).max(axis=1).min()
         assert np.abs(world_map.stations[middle, :2] - centre).max() == pytest.approx(nearest)
+
+
+@pytest.fixture(scope="module")
+def twice(map_points):
+    """The small world twice, the second time turned by a quarter and without its southern border."""
+    turned = (map_points @ rot_z(0.5 * np.pi).T)[map_points[:, 0] > -14.0] + np.array([192.0, 0.0, 0.0])
+    return BaseMap.build(np.concatenate([map_points, turned]).astype(np.float32), radius=30.0)
+
+
+@pytest.mark.parametrize("whole", [True, False], ids=["all stations", "squares"])
+def test_place_has_its_copy_among_those_that_look_like_it(twice, whole, request):
+    if not whole:
+        request.getfixturevalue("few_are_many")
+    compared, origin = SearchStations.of(twice.station_index, twice.station_grid), np.asarray(twice.origin)
+    assert (compared.squares is None) == whole
+    to_copy = pose_from(rot_z(0.5 * np.pi), [192.0, 0.0, 0.0])
+    for x, y in ((3.0, 5.0), (-8.0, 12.0), (6.5, -9.5)):
+        alike = compared.alike(np.array([x, y, 0.0]) - origin, ConsensusConfig())
+        there = transform(to_copy, np.array([[x, y, 0.0]]))[0] - origin
+        off = [np.linalg.norm((transform(T, np.array([[x, y, 0.0]]) - origin)[0] - there)[:2]) for T in alike]
+        assert min(off) < 2.5
+        assert yaw_of(alike[np.argmin(off)]) == pytest.approx(0.5 * np.pi, abs=0.06)
 
 
 def test_storeys_have_squares_of_their_own(few_are_many, world_map):
