@@ -20,7 +20,7 @@ EYE = 1.7
 """Height of the sensor above the ground in metres, if unknown."""
 
 LOWEST_EYE = 0.3
-"""Least height of a sensor above the ground, metres: higher points stand on walls, down the slope or behind it."""
+"""Least height of a sensor above ground, metres: points less far below it stand on walls, down a slope or behind it."""
 
 FLOOR_RADIUS = 15.0
 """Metres around a body within which its lidar sees ground: a VLP-16 at a height of 2 m does from 7.5 m on."""
@@ -43,9 +43,9 @@ def channel(name: Channel, grid: PolarGrid) -> Descriptor:
 
 
 def describe(points: Points, centre: Floats, config: DescriptorConfig) -> dict[Channel, Descriptor]:
-    """Describe a virtual local scan, gravity-aligned points (N, 3), one per voxel, by channels, (R, S) each.
+    """Describe a virtual local scan, gravity-aligned points (N, 3), metres, one per voxel, by channels, (R, S) each.
 
-    ``centre`` (3,), metres, is the zero of the descriptor: the keyframe's x and y, and the ground's height below it.
+    ``centre`` (3,) is the zero of the descriptor: the keyframe's x and y, and the ground's height below it.
     """
     grid, _ = kernels.polar_bin(points, centre, config.rings, config.sectors, config.radius)
     return {name: channel(name, grid) for name in config.channels}

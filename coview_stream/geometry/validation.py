@@ -98,7 +98,7 @@ def check_stamp(stamp: float, newest: float | None = None) -> None:
 
 
 def check_rigid(T: npt.ArrayLike, name: str, error: type[InputError] = InputError) -> Pose:
-    """Return a rigid pose (4, 4) float64, exactly orthonormal; ``error`` for anything else."""
+    """Return a rigid pose (4, 4) float64, orthonormal to rounding; ``error`` for anything else."""
     pose = to_array(T, np.float64, name, error)
     if not is_pose(pose):
         raise error(f"{name} {why_no_pose(pose)}")

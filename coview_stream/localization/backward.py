@@ -1,6 +1,6 @@
 """Backward tracking of a recorded run, from a fix to the frames before it.
 
-Frames before the first fix and within interruptions have no live pose. A later fix allows to track them in reverse, by
+Frames before the first fix and within interruptions have no live pose. From a later fix they are tracked in reverse, by
 the same registration, verification and loss monitor. So a slip, a carried robot or restarted odometry ends backward
 tracking as it ends live tracking.
 """

@@ -146,7 +146,7 @@ class RunResult:
 
     @property
     def trajectory(self) -> tuple[Floats, Poses]:
-        """Stamps and poses likewise, :attr:`smoothed` where the run is, else live."""
+        """Stamps and poses likewise, :attr:`smoothed` if the run was, else live."""
         return self.filtered if self.smoothed is None else _trajectory(self.smoothed)
 
     @property
@@ -351,7 +351,7 @@ def _dropped(counters: dict[str, int], frames: int) -> str:
 def write(located: RunResult, base_map: BaseMap, out: str | os.PathLike[str]) -> None:
     """Write ``trajectory.tum`` (posed frames only) and ``result.json`` into ``out``; remove an earlier run's pictures.
 
-    A smoothed run has its smoothed poses there, and the live ones in ``filtered.tum``.
+    The trajectory of a smoothed run has its smoothed poses, and ``filtered.tum`` the live ones.
 
     Raises:
         InputError: the directory cannot be written.

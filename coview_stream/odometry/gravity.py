@@ -18,7 +18,7 @@ from coview_stream.config.odometry import MAX_TILT
 from coview_stream.geometry.arrays import Floats, Indices, Reals
 
 SLOPE = float(np.radians(4.0))
-"""One sigma of the lean of the ground's normal, radians, from these figures."""
+"""One sigma of the lean of the ground's normal, radians, from the figures above."""
 
 # the ground; set by hand
 _REACH = 25.0  # metres around the sensor
@@ -43,7 +43,7 @@ _WALL_MAX_LEAN = np.sin(np.radians(15.0))
 _WALL_SIGMA = np.radians(2.0)  # of a patch; larger leans count less and less
 _WALL_ROUNDS = 10
 _WIDE = float(np.radians(10.0))  # initial sigma of the direction in a search for walls
-_UNSEEN = float(np.radians(30.0))  # sigma of the walls' vertical in the direction that all walls face
+_UNSEEN = float(np.radians(30.0))  # sigma of the walls' vertical in a direction that no wall faces
 
 
 @dataclass(frozen=True)
@@ -105,7 +105,7 @@ def _checked(lowest: Floats, plane: tuple[Floats, float] | None) -> Ground | str
 def gravity_from_walls(points: Reals, up: Floats) -> tuple[Floats, int]:
     """Correct ``up`` (3,), found by the ground, by the walls in a cloud (N, 3), metres; count their patches, too.
 
-    Directions without walls stay unchanged.
+    Directions that no wall faces stay unchanged.
     """
     better, _, count = wall_evidence(points, up, SLOPE)
     return better, count

@@ -102,7 +102,7 @@ class LidarOdometry:
         config: the settings.
         ground: the plane behind gravity's direction; None before the first frame, and with given gravity.
         points: (N, 3) float32, the finite points of the newest frame, deskewed: input of a ``Localizer``.
-        restarts: number of restarts of the local map, after a gap or an impossible motion, which the odometry lacks.
+        restarts: number of restarts of the local map, after gaps or impossible motions; odometry lacks the motion then.
     """
 
     def __init__(self, config: LidarOdometryConfig | None = None, registration: ScanRegistration | None = None) -> None:

@@ -23,7 +23,7 @@ SCATTER = 2.0  # distance between points that form no surface, in widths of the 
 MARGIN = 0.15  # metres by which a search exceeds its limit, to serve later poses; 0.05 to 0.3 are as fast
 BLOCK = 6  # 2^6 points per thread in turn, as points with long searches come in clusters
 
-# memory of a point: its position at the last search (3), and a lower bound of the distance to other points from there
+# memory of a point: position at the last search (3); from there all map points but its partner are at least this far
 SAFE, PLACE = 3, 4
 # partner of a point: position (3) and normal (3); far away if there is none
 PARTNER = 6

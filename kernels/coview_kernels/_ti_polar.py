@@ -26,7 +26,7 @@ OUTSIDE, BROKEN, NEAR, BEHIND = 0, 1, 2, 3
 
 @ti.func
 def polar(dx: f32, dy: f32, rings: f32, sectors: f32, per_metre: f32):
-    """Return range in rings, at most ``rings + 1.5``, to 1e-6 of all; angle in sectors, to 3e-6 of all."""
+    """Return range in rings, at most ``rings + 1.5``, to 1e-6 ``rings``; angle in sectors, to 3e-6 ``sectors``."""
     far = ti.sqrt(dx * dx + dy * dy) * per_metre
     far = ti.select(far < rings + 1.5, far, rings + 1.5)
     ax, ay = ti.abs(dx), ti.abs(dy)
@@ -151,7 +151,7 @@ def station_bins(
     stations: i32, chunks: i32, size: i32, top: Floats, points: Integers, base: Integers, ground: Floats,
     starts: Integers, offsets: Integers, highest: Floats, count: Integers,
 ):  # fmt: skip
-    """Sum into bin b of a station the cells ``base + offsets[starts[b]:starts[b + 1]]`` of the padded raster.
+    """Gather into bin b of a station the cells ``base + offsets[starts[b]:starts[b + 1]]`` of the padded raster.
 
     The cells are sorted by bin, so that a bin is summed in registers and stored once.
     """

@@ -87,8 +87,8 @@ def nearest(grid: PointGrid, queries: npt.ArrayLike, radius: float, T: npt.Array
         T: (4, 4) ``T_cloud_queries`` that moves the queries, in float64; None if they are in the cloud's frame.
 
     Returns:
-        Distances (N,) float64, inf without such a point, and indices (N,) into the cloud, then K. Any of several
-        equally near points may be returned.
+        Distances (N,) float64 and indices (N,) into the cloud; inf and K without such a point. Any of several equally
+        near points may be returned.
 
     Raises:
         ValueError: a shape is wrong, ``T`` is not finite, or ``radius`` is not finite and positive.

@@ -154,7 +154,7 @@ def _cache_folder(library: Any) -> Path:
     """Return the folder of compiled kernels; for quadrants a subfolder, as it finds a kernel by its source.
 
     That search (see :func:`kernel`) ignores the constants of a kernel's functions, so a hash of all our sources names
-    the subfolder. Native code is loaded unchecked: if others may write there, all is recompiled in a private folder.
+    the subfolder. Native code is loaded unchecked: if others may write there, this process compiles in its own folder.
     """
     quadrants = library.__name__ == "quadrants"
     named = os.environ.get(f"{'QD' if quadrants else 'TI'}_OFFLINE_CACHE_FILE_PATH")

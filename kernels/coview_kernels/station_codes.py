@@ -417,7 +417,7 @@ def _spectra(columns: F32) -> C64:
 
 
 def _eigenvectors(sample: C64, tiers: int) -> list[C64]:
-    """Return by tier the eigenvectors (16, 16, D) of spectra's (32, m, D) second moments, greatest first; else 0."""
+    """Return by tier eigenvectors (16, 16, D) of spectra's (32, m, D) second moments, greatest first; 0 beyond D."""
     moments = np.matmul(sample.transpose(0, 2, 1).astype(np.complex128), sample.conj())
     vectors = np.linalg.eigh(moments)[1][:, :, ::-1]  # (32, D, D)
     found = np.zeros((tiers, _ROWS, _LANES, sample.shape[2]), dtype=np.complex64)

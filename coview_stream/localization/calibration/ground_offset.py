@@ -34,7 +34,7 @@ _NONE = 0.98  # prior of no offset: 0.9 left drives through changed campuses (be
 _NONE_SIGMA, _SIGMA = 0.02, 0.2  # metres, of the two hypotheses
 _VIEWED = 0.07  # metres, one sigma of the height difference between structure seen from below and above
 _INDEPENDENT = 0.3  # observations per patch: neighbours have common errors
-_MEMORY = 0.9  # decay of earlier registrations, per registration
+_MEMORY = 0.9  # weight of earlier registrations, from one to the next
 _FOLLOWED = 0.25  # share of a change applied per registration, for a smooth height
 _STILL, _CHANGED = 0.6, 0.1  # probability that an earlier offset still holds; its sigma, metres
 

@@ -65,7 +65,7 @@ class Background:
     number: tuple[float, float]  # effective numbers of independent structure points and of free points
     # probability that a chance place is as clear and level as the right one; (Q, L) by nuisance values
     open: float | Floats = OPEN
-    around: Floats | None = None  # (4,) the same around chance places; None if not observed
+    around: Floats | None = None  # (4,) like structure, around chance places; None if not observed
     # (4,) variances among the neighbours of one place, in units of one point's
     within: Floats = field(default_factory=lambda: np.zeros(4))
     between: Floats = field(default_factory=lambda: np.zeros(4))  # (4,) variances of around from place to place

@@ -22,7 +22,7 @@ _SMEARED = np.radians(1.0)  # change of the level that makes keyframes be gather
 
 # of OdometryCheck; _MIN_SHARE is set by hand between the shares in its docstring
 _VOXEL, _BITS = 1.0, 21  # metres; bits of a coordinate in a voxel's key
-_STRIDE = 2.0  # metres, largest distance between reference frames
+_STRIDE = 2.0  # metres from a reference frame beyond which a frame replaces it
 _POINTS = 2000  # compared per frame
 _MIN_POINTS = 300  # of a frame, to judge it
 _MIN_SHARE = 0.22

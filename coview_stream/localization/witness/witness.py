@@ -39,7 +39,7 @@ from coview_stream.localization.witness.first_motions import Conventions
 from coview_stream.localization.witness.stamps import step_stamps
 
 _METRES, _SECONDS, _TURN = 1.0, 1.0, np.radians(10.0)  # step limits, whichever comes first
-_SHORTEST = 0.3  # least seconds of a step that is shorter than
+_SHORTEST = 0.3  # least seconds of a step shorter than _FAR
 _FAR = 5.0  # metres
 _MANY = 5  # frames of a step, to which one more makes little difference
 _RECENT = 3  # odometry frames that define the velocity
