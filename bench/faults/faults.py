@@ -69,7 +69,7 @@ class Feed:
         return interpolate(poses[after - 1], poses[after], np.clip(share, 0.0, 1.0))
 
     def stamped(self, late: Floats) -> Feed:
-        """Return the run with clouds stamped ``late`` by (K,) seconds, without clouds after the end of odometry."""
+        """Return the run with clouds stamped ``late`` (K,) seconds later, without clouds after the end of odometry."""
         stamps = self.stamps + late
         rows = np.flatnonzero(stamps <= self.stamps[-1])
         picked = self.picked(rows)

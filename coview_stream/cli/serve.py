@@ -191,7 +191,7 @@ def run(args: argparse.Namespace) -> int:
 
 
 def settings(args: argparse.Namespace) -> dict[str, dict[str, Any]]:
-    """Complete the arguments from ``--config`` and the defaults; return the file's tables. ConfigError if wrong."""
+    """Complete arguments by ``--config`` and defaults; return its tables. ConfigError: a mistake, no map or robot."""
     tables: dict[str, dict[str, Any]] = {name: {} for name in TABLES}
     args.from_file, args.ros_node = set(), None
     declared = argparse.ArgumentParser()

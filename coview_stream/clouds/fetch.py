@@ -214,7 +214,7 @@ class RangeFile:
         return self._at
 
     def read(self, size: int) -> bytes:
-        """Return ``size`` bytes, fewer at the file's end; CloudError if the file is missing or it has no ranges."""
+        """Return ``size`` bytes, fewer at the file's end; CloudError if the server lacks it or serves no ranges."""
         begin = self._at - self._begin
         if not (begin >= 0 and begin + size <= len(self._block)):
             self._block, self._begin, begin = self._request(max(size, _BLOCK)), self._at, 0

@@ -2,7 +2,7 @@
 
 The ground comes from :mod:`coview_stream.odometry.gravity`. If odometry contradicts the lidar, both are read in each of
 the usual wrong conventions (:mod:`coview_stream.localization.witness.conventions`, as in the localizer). Readings are
-compared by the probability that odometry follows the lidar's motions; a finding names the best one.
+compared by the probability that odometry follows the lidar's motions; a finding states it.
 """
 
 from __future__ import annotations

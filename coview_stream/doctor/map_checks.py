@@ -218,7 +218,7 @@ def place_finding(run: Run, base_map: BaseMap, config: LocalizerConfig, progress
 
 
 def in_feet(base_map: BaseMap, progress: bool = False) -> BaseMap | None:
-    """Return the map as if its coordinates were feet, with a bar on stderr if ``progress``; None if it were empty."""
+    """Return the map as if its coordinates were feet, with a bar on stderr if ``progress``; None if that fails."""
     from coview_stream.basemap.basemap import BaseMap
 
     try:

@@ -109,7 +109,7 @@ def path_of(poses: Floats) -> tuple[Floats, Floats]:
 
 
 def spaced(driven: Floats, step: float) -> Ints:
-    """Choose indices into metres driven (K,), ``step`` or more apart, and the last one if over half a step away."""
+    """Choose indices into metres driven (K,): 0, others ``step`` or more apart, the last if over half a step away."""
     chosen = [0]
     for k in range(1, len(driven)):
         if driven[k] - driven[chosen[-1]] >= step:

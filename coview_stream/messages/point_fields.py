@@ -81,7 +81,7 @@ def read_table(table: Table, stamp_ns: int) -> CloudMessage:
     x, y, z = (known[name] for name in "xyz")
     time = next((known[name] for name in TIME_NAMES if name in known), None)
     ring = next((known[name] for name in RING_NAMES if name in known), None)
-    with np.errstate(over="ignore", invalid="ignore"):  # overflow becomes infinity; signalling NaN
+    with np.errstate(over="ignore", invalid="ignore"):  # overflow becomes infinity; some NaN signal
         if table.step == 12 and (x[1:], y[1:], z[1:]) == (("<f4", 0), ("<f4", 4), ("<f4", 8)):
             points = np.ascontiguousarray(table.column(x, 3), dtype=np.float32)
         else:

@@ -38,7 +38,7 @@ class OdometryConfig:
     position_walk: float = 0.004  # random walk of the position, metres per square root of a metre, one sigma
     # error of roll and pitch, radians, one sigma, independent between frames
     tilt_noise: float = float(np.radians(0.05))
-    offset: float = 400.0  # greatest distance of the start from the odometry's origin, metres (a tenth in z)
+    offset: float = 400.0  # the odometry starts within +- this of its origin in x and y, a tenth in z, metres
 
     def __post_init__(self) -> None:
         within(self, **{field.name: (0.0, 1e5 if field.name == "offset" else 1.0) for field in fields(self)})

@@ -181,7 +181,7 @@ def base_map(scene: Scene, config: SimulationConfig, step: Progress | None = Non
 
 
 def _indoors(scene: Scene, hall: Footprint, rng: np.random.Generator) -> Floats:
-    """Scan a hall from inside and from its gates, as walls have two sides: (N, 3) float64, scene frame."""
+    """Scan a hall from inside and in front of its gates, as walls have two sides: (N, 3) float64, scene frame."""
     scanner, caster = SENSORS["blk360"](), Caster(scene.mapped)
     ahead = np.array([np.cos(hall.yaw), np.sin(hall.yaw)])
     clouds = []

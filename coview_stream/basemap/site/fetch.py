@@ -248,7 +248,7 @@ class Mirror:
             local = read_manifest(self.directory)
             before = self._read(local, str(self.directory))
         wanted = self._wanted(manifest)
-        if (size := sum(layer.bytes for layer, _ in wanted.values())) > cache_bound():  # also wrong sizes
+        if (size := sum(layer.bytes for layer, _ in wanted.values())) > cache_bound():  # a wrong manifest's too
             raise MapError(
                 f"{self.source.name}: its tiles are {size / 1e9:.1f} GB, more than the cache may hold; open a part of "
                 "it (--around X,Y,RADIUS), or set COVIEW_CACHE_GB"

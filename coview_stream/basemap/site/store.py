@@ -109,7 +109,7 @@ _OURS = (f"{_HASH}*.coview", f"joined-{_HASH}*.coview", "parts/*", "sites/[0-9a-
 
 
 def cache_folder() -> Path:
-    """Return the cache folder, created if it does not exist; MapError if other users may write to it."""
+    """Return the cache folder, created if it does not exist; MapError unless it is its user's alone."""
     named = os.environ.get("COVIEW_CACHE")
     base = os.environ.get("XDG_CACHE_HOME") or str(Path("~/.cache").expanduser())
     folder = Path(named) if named else Path(base) / "coview-stream"

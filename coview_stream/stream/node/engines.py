@@ -167,7 +167,7 @@ class SearchEngine(Engine):
 
 
 class OdometryEngine(Engine):
-    """One :class:`LidarOdometry` per robot, with its own ``registration``; DependencyError if kiss-icp is missing."""
+    """One :class:`LidarOdometry` and ``registration`` per robot; DependencyError, with remedy, without kiss-icp."""
 
     def __init__(self, registration: Callable[[LidarOdometryConfig], ScanRegistration] = KissRegistration) -> None:
         self._registration = registration

@@ -122,7 +122,7 @@ class NodeHealth:
 
 
 def metrics_server(address: str, document: Callable[[], dict[str, Any]]) -> HttpServer:
-    """Return a server for ``/metrics`` (Prometheus) and ``/health`` (JSON); ConfigError if ``address`` is unusable."""
+    """Return a server of ``/metrics`` and ``/health`` (JSON; 200 if ready, else 503); ConfigError for a bad address."""
 
     def metrics(_: str) -> Reply:
         return Reply(prometheus_text(document()).encode(), "text/plain; version=0.0.4; charset=utf-8")

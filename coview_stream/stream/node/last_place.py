@@ -47,7 +47,7 @@ _GUESS_FIELDS = ("x", "y", "yaw", "distance", "angle", "map", "within")
 class LastPlace:
     """A robot's place on a map. Files hold its ``T_map_body``, messages between nodes its ``T_map_odom``."""
 
-    map_sha256: str  # of the base map, 64 hexadecimal digits; for a site of its state
+    map_sha256: str  # of the base map, 64 hexadecimal digits; for a site, that of its state
     stamp_ns: int | None = None  # sensor time of ``T_map_body``, nanoseconds
     T_map_body: Pose | None = None  # (4, 4) float64 in the frame of the map's sources, metres
     T_map_odom: Pose | None = None  # (4, 4) map <- odometry; odometry continues when another node takes over

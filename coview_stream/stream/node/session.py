@@ -191,7 +191,7 @@ class Session:
             T_map_body = old.hints.T_map_body if pose is None else pose.T_map_body
             calibration, forgotten = old.robot_state.calibration or old.hints.calibration, old.hints.forgotten
             guess = old.hints.guess if old.parts is None and self.parts is None else None
-            with self.lock:  # under both locks: other sessions of the robot are independent
+            with self.lock:  # under both locks, the old session's first, as in continue_from
                 self.inputs.continue_from(old.inputs)
         with self.lock:
             # without its circle, which belongs to the old map

@@ -16,9 +16,9 @@ Policy = Literal["newest", "all"]
 """``newest``: a slow reader sees only the newest sample (a ring of one). ``all``: every sample, in order."""
 
 Urgency = Literal["realtime", "data", "report", "bulk"]
-"""``realtime``: small and urgent (poses): express, never waits. ``data``: must arrive (odometry): blocks, never drops.
-``report``: statuses: a stopped reader misses some and blocks no other reader. ``bulk``: clouds: only the newest frame
-matters, one that does not fit is dropped."""
+"""``realtime``: small and urgent (poses): express, never waits. ``data``: must arrive (odometry): blocks rather than
+drops. ``report``: statuses: a stopped reader misses some and blocks no other reader. ``bulk``: clouds: only the newest
+frame matters, one that does not fit is dropped."""
 
 
 class Publisher(Protocol):

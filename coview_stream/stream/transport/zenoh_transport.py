@@ -236,7 +236,7 @@ class ZenohTransport:
         )
 
     def close(self) -> None:
-        """Undeclare everything and end the threads in well under a second, up to two on a blocked link; idempotent."""
+        """Undeclare, give queued messages 0.3 s, end the threads; within 1 s, or 2 s on a blocked link; idempotent."""
         with self._lock:
             if self._closing.is_set():
                 return
