@@ -82,7 +82,7 @@ def is_run(path: Path) -> bool:
 
 
 def find_bag(path: Path) -> Path | None:
-    """Find the recording at ``path``, a file or rosbag2 directory; else None. RunError for several without an index."""
+    """Find the recording at ``path``, file or rosbag2 directory, else None. RunError: several, no metadata.yaml."""
     if not path.is_dir():
         return path if path.suffix in _BAGS and path.is_file() else None
     if (path / "frames").is_dir() or (path / "velodyne").is_dir():

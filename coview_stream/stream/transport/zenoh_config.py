@@ -1,4 +1,4 @@
-"""Configuration of a zenoh session: the user's file, then our defaults; zenoh's errors as one line with a remedy."""
+"""Configuration of a zenoh session: the user's file, else our defaults; zenoh's errors as one line with a remedy."""
 
 from __future__ import annotations
 
