@@ -102,7 +102,7 @@ class FramePreparation:
         return PreparedFrame(raw, T, T_raw, stamp, RawScan(points, T, self.calibration, moment))
 
     def knows_moment(self, stamp: float) -> bool:
-        """Return whether odometry covers the moment at which the cloud was measured, within 2 sigma of the delay."""
+        """Return whether odometry reaches back to a cloud's moment, with a delay of 2 sigma below the estimate."""
         late = self.calibration.delay - 2.0 * self.calibration.sigma_delay
         return late <= 0.0 or self.estimator.history.covers(stamp - late, stamp)
 

@@ -5,7 +5,7 @@ motion in the body's axes, s and w as in :mod:`coview_stream.localization.calibr
 differs from odometry's (hand-eye calibration, to first order) by
 
 * t x ε + s t in position. The components along the path (s) and along the body's z (ε) are used; the third shows the
-  heading of the sensor on the body, which is not estimated.
+  heading of the sensor on the body (eq. C2).
 * (R - I) ε + w |t| z in rotation: a turning robot also observes its roll (eq. C4).
 
 The registration also corrects the motion itself, as drift of odometry smears the virtual scan of many keyframes. Both
