@@ -65,10 +65,7 @@ TABLES = ("node", "localizer", "lidar_odometry")
 NOT_IN_TABLES = {"sensor_leans": ("localizer", "odometry decides it"), "mount": ("node", "set it above")}
 """Fields that a table may not set, with the reason."""
 
-_DEFAULTS = {
-    "preset": "native", "base": "coview", "domain": 0, "odometry": ROBOT, "reloc": None,
-    "risk": None,
-}  # fmt: skip
+_DEFAULTS = {"preset": "native", "base": "coview", "domain": 0, "odometry": ROBOT, "reloc": None, "risk": None}
 """Options whose defaults --config may replace; None: the configuration's."""
 
 _TWICE = {

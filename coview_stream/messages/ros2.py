@@ -23,9 +23,7 @@ ODOMETRY = "nav_msgs/msg/Odometry"
 POSE = "geometry_msgs/msg/PoseWithCovarianceStamped"
 
 _KINDS = {1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 8: "f8"}
-_XCDR2 = {
-    6: "CDR2_BE", 7: "CDR2_LE", 8: "D_CDR2_BE", 9: "D_CDR2_LE", 10: "PL_CDR2_BE", 11: "PL_CDR2_LE",
-}  # fmt: skip
+_XCDR2 = {6: "CDR2_BE", 7: "CDR2_LE", 8: "D_CDR2_BE", 9: "D_CDR2_LE", 10: "PL_CDR2_BE", 11: "PL_CDR2_LE"}
 _NUMBERS = {f"<{kind}": number for number, kind in _KINDS.items()}
 
 

@@ -25,7 +25,6 @@ _STATIONS = 4096  # from which a keyframe is observed
 _FOLLOWED = 96  # drives that continue, and new ones looked up at earlier keyframes: gives their count to a tenth
 _PRESUMED = 1.0 / OPEN  # weight of the presumed share in places: one of them is open
 _STEPS = 5  # of expectation and maximization
-_EVERY = 8  # every 8th structure point is looked up
 _BLOCK = 512  # places at a time: intermediate arrays stay in the cache
 _SEED = 20240
 SIGHT = 35.0
@@ -154,9 +153,9 @@ class OpenPlaces:
 
 
 def _ground(scan: ObservedScan) -> ScanPart:
-    """Return the few points of a scan, with every 8th structure point, which only move it as at scored places."""
+    """Return the few ground and free points of a scan."""
     points = scan.few.points
-    return replace(scan.few, points=replace(points, structure=points.structure[::_EVERY]))
+    return replace(scan.few, points=replace(points, structure=points.structure[:0]))
 
 
 def _odds_against(observed: Floats32, background: Background) -> Floats32:

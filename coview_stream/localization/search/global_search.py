@@ -119,8 +119,7 @@ class GlobalSearch:
         self._guesses = HintSchedule()
         self._scorer.clear()
         self._keyframes = 0
-        self._named: list[Hypothesis] = []  # by the map, as places like the leader
-        self._rank = 0  # of that leader in its votes, and so of these places
+        self._named: list[tuple[Hypothesis, int]] = []  # places like the leader, with its rank in the votes
 
     def reset(self) -> None:
         """Forget all votes and observations, and the newest descriptors."""
@@ -136,8 +135,8 @@ class GlobalSearch:
         self._vote(request)  # eqs 1-9: descriptors, compared with all stations at all turns
         voted, ranks = self._propose()  # eq. 12: peaks of the consensus as T_map_odom
         guessed = self._guessed(request)
-        voted = [*voted, *guessed, *self._named]
-        ranks = [*ranks, *range(len(guessed)), *[self._rank] * len(self._named)]
+        voted = [*voted, *guessed, *(place for place, _ in self._named)]
+        ranks = [*ranks, *range(len(guessed)), *(rank for _, rank in self._named)]
         hints = self._hints.due(request.hints)
         hypotheses, scan = [*voted, *hints], self._observed(request)
         scored = self._scorer.score(hypotheses, ranks, len(hints), scan, request.lean_prior)  # against chance
@@ -148,8 +147,8 @@ class GlobalSearch:
             reading = self._leaning(reading, hypotheses, ranks, len(hints)) or reading
         self._note_hints(reading.scored, hints, request)
         alike = self._alike(reading)
-        self._named = sorted(alike, key=lambda place: -place.probability)[:_NAMED]
-        self._rank = int(reading.scorer.followed.votes[0]) if alike else 0
+        best = sorted(alike, key=lambda place: -place.probability)[:_NAMED]
+        self._named = [(place, int(reading.scorer.followed.votes[0])) for place in best]
         reading = replace(reading, scored=reading.scored.beside(alike))
         result = self._decide(reading)
         if result.accepted is not None:

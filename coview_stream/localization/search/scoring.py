@@ -46,7 +46,8 @@ _KEPT = 16  # places kept by their evidence, whatever their rank at the newest k
 _KEYFRAMES = 12  # keyframes with observations: the newest and the most spread earlier ones
 _NEWEST = 8  # newest keyframes, searched for a moved part
 _CHANCE = 112  # places that measure the correlation of chance over keyframes
-_CHANCE_DISTANCE, _CHANCE_ANGLE = 6.0, np.radians(20.0)  # from the leader; closer places share its explanation
+_RENEWED = 28  # of them at each keyframe: only these are looked up at all earlier keyframes
+_CHANCE_REACH = 6.0, np.radians(20.0)  # metres, radians from the leader; closer places share its explanation
 BASIN_DISTANCE, BASIN_ANGLE = SAME_DISTANCE, float(np.radians(15.0))
 """Metres and radians from the leader within which registration converges to it."""
 
@@ -195,14 +196,14 @@ class PlaceScorer:
         self._followed = Followed.none()
         self._scans: list[ObservedScan] = []
         self._scatter: list[Floats] = []
+        self._chance = np.empty((0, 4)), self._followed.observed  # poses at the newest keyframe, observations at all
 
     def go_on_with(self, scans: list[ObservedScan]) -> None:
         """Start with earlier keyframes, oldest first, by which places are compared, too."""
         self._scans = scans
         self._scatter = [np.full(4, np.nan)] * len(scans)
-        self._followed = replace(
-            Followed.none(), observed=np.empty((0, len(scans), NEARBY_VARIANCE.stop), dtype=np.float32)
-        )
+        nowhere = np.empty((0, len(scans), NEARBY_VARIANCE.stop), dtype=np.float32)
+        self._followed, self._chance = replace(Followed.none(), observed=nowhere), (np.empty((0, 4)), nowhere)
 
     def score(
         self, hypotheses: Sequence[Hypothesis], votes: Sequence[int], hints: int, scan: ObservedScan, prior: float = 0.0
@@ -215,9 +216,7 @@ class PlaceScorer:
         """
         followed, voted = self._followed, len(hypotheses) - hints
         count = len(followed.hypotheses)
-        all_hypotheses = [
-            *followed.hypotheses, *hypotheses[:voted], *self._around_leader(), *hypotheses[voted:]
-        ]  # fmt: skip
+        all_hypotheses = [*followed.hypotheses, *hypotheses[:voted], *self._around_leader(), *hypotheses[voted:]]
         ranks = np.full(len(all_hypotheses), len(all_hypotheses))
         ranks[:count] = followed.votes + 1
         ranks[count : count + voted] = votes[:voted]
@@ -248,7 +247,7 @@ class PlaceScorer:
     def beside_leader(self, T_map_odom: Floats, scan: ObservedScan) -> list[Hypothesis]:
         """Return those of further places (H, 4, 4) that are not scored yet, with their odds against the leader.
 
-        They have the leader's prior probability, and the background of the newest keyframe.
+        They have the leader's prior probability, as no vote has ranked them, and the background of the newest keyframe.
         """
         leader, layers = self._followed.observed[:1], self._base_map.field
         known = scan.poses(np.array([place.T_map_odom for place in self._followed.hypotheses]))
@@ -282,6 +281,7 @@ class PlaceScorer:
         self._open.forget(least)
         rest = np.arange(self._followed.observed.shape[1]) != least
         self._followed = replace(self._followed, observed=self._followed.observed[:, rest])
+        self._chance = self._chance[0], self._chance[1][:, rest]
 
     def _around_leader(self) -> list[Hypothesis]:
         if not self._followed.hypotheses:
@@ -347,8 +347,7 @@ class PlaceScorer:
     def _look_back(self, T_map_odom: Floats, scans: Sequence[ObservedScan]) -> Floats32:
         """Return observations (P, W, 15) of earlier keyframes, oldest first, at new places, corrected for drift."""
         out = np.empty((len(T_map_odom), len(scans), NEARBY_VARIANCE.stop), dtype=np.float32)
-        for k in reversed(range(len(scans))):
-            scan = scans[k]
+        for k, scan in reversed(list(enumerate(scans))):
             observed = scan.few.look_up(self._base_map.field, scan.poses(T_map_odom), Move.NEAR)
             around = observe_around(self._base_map.field, scan.few, observed.poses)
             out[:, k], T_map_odom = np.column_stack([observed.shares, around]), scan.transforms(observed.poses)
@@ -360,46 +359,55 @@ class PlaceScorer:
         if not len(mean):
             self._scatter.append(np.full(4, np.nan))
             self._open.clear()
+            self._chance = np.empty((0, 4)), followed.observed
             return np.empty(0), np.empty(0)
         scans = [*self._scans, scan]
         structure, free = np.mean([at.patches for at in scans], axis=0)
         most = Most(float(structure), float(free), surroundings(scans))
         poses, places = observed.poses[followed.newest], observed.poses[first]
         chance, distant = np.ones(len(first), dtype=bool), np.ones(len(mean), dtype=bool)
-        elsewhere, leader = chance, None
         self._scatter.append(scatter(observed.shares[first]))
         stations = [-1 if place.station is None else place.station for place in followed.hypotheses]
         above = (poses[:, 2] - self._base_map.stations[stations, 2])[np.array(stations) >= 0]
         anywhere = self._base_map.stations
-        if self.area is not None:
-            anywhere = anywhere[self.area.holds(anywhere)]
+        anywhere = anywhere if self.area is None else anywhere[self.area.holds(anywhere)]
         height = float(np.median(above)) if len(above) else 0.0
         self._open.look(self._base_map.field, anywhere, self._scans, scan, height)
-        sample, over_time = self._over_time(observed, first, scan)
-        scored = over_time.mean(axis=1)
+        self._chance = sample, over_time = self._over_time(places, observed.shares[first], scan)
+        wrong, elsewhere, leader = np.ones(len(sample), dtype=bool), np.ones(len(sample), dtype=bool), None
         for last in (False, True):
             measured = [row for row in self._scatter if np.isfinite(row).all()] or [self._scatter[-1]]
-            left = left_in_mean(over_time[chance[sample]])
+            left = left_in_mean(over_time[wrong])
             spread = np.mean(measured, axis=0) * left
-            now = observed.shares[first][chance]
-            background = estimate_background(now, spread, mean[distant], most)
-            background = replace(background, open=self._open.share(scored[elsewhere[sample]], background, leader))
+            background = estimate_background(observed.shares[first][chance], spread, mean[distant], most)
+            background = replace(background, open=self._open.share(over_time[elsewhere].mean(1), background, leader))
             ratios = log_likelihood_ratios(mean, background)
             if last:
                 break
             leader = poses[np.argmin(np.log1p(followed.votes) - ratios)]
-            elsewhere = _apart(places, leader, SIGHT, np.pi)
+            elsewhere = _apart(sample, leader, SIGHT, np.pi)
             # places around the leader share its explanation
-            chance, distant = (_apart(at, leader, _CHANCE_DISTANCE, _CHANCE_ANGLE) for at in (places, poses))
+            chance, distant, wrong = (_apart(at, leader, *_CHANCE_REACH) for at in (places, poses, sample))
             self._scatter[-1] = scatter(observed.shares[first][chance])
         self._background, self._left = background, float(left[:3].mean())
         return ratios, self._left * ratio_variances(mean, background)  # shrinks like the scatter
 
-    def _over_time(self, observed: _Observed, first: Ints, scan: ObservedScan) -> tuple[Ints, Floats32]:
-        """Return a sample (N,) of the places, and the observations (N, W, 15) of all keyframes there."""
-        sample = np.linspace(0, len(first) - 1, min(len(first), _CHANCE)).astype(np.int64)
-        history = self._look_back(scan.transforms(observed.poses[first[sample]]), self._scans)
-        return sample, np.concatenate([history, observed.shares[first[sample]][:, None]], axis=1)
+    def _over_time(self, places: Floats, shares: Floats32, scan: ObservedScan) -> tuple[Floats, Floats32]:
+        """Return poses (S, 4) of chance places at a keyframe, and observations (S, W, 15) there at all keyframes.
+
+        Most are the last keyframe's, observed once more; the rest are of ``places`` (N, 4), observed as ``shares``.
+        """
+        layers, (poses, history) = self._base_map.field, self._chance
+        poses, history = poses[_RENEWED - _CHANCE :], history[_RENEWED - _CHANCE :]  # the rest are the oldest
+        if self._scans:
+            poses = scan.poses(self._scans[-1].transforms(poses))
+        again = scan.few.look_up(layers, poses, Move.NEAR)
+        now = np.column_stack([again.shares, observe_around(layers, scan.few, again.poses)])
+        history = np.concatenate([history, now[:, None]], axis=1)
+        others = np.flatnonzero(~_same(places, again.poses).any(axis=1))
+        rows = others[np.linspace(0, len(others) - 1, min(len(others), _CHANCE - len(poses))).astype(np.int64)]
+        new = np.concatenate([self._look_back(scan.transforms(places[rows]), self._scans), shares[rows][:, None]], 1)
+        return np.concatenate([again.poses, places[rows]]), np.concatenate([history, new])
 
 
 def _apart(poses: Floats, leader: Floats, distance: float, angle: float) -> Bools:
@@ -408,17 +416,18 @@ def _apart(poses: Floats, leader: Floats, distance: float, angle: float) -> Bool
     return np.asarray((np.linalg.norm(poses[:, :3] - leader[:3], axis=1) > distance) | (turn > angle))
 
 
+def _same(poses: Floats, others: Floats) -> Bools:
+    """Return a mask (P, Q) of the poses (P, 4) and the others (Q, 4) that are one place."""
+    (x, y, z, yaw), (u, v, w, turn) = poses.astype(np.float32).T, others.astype(np.float32).T
+    gap = np.square(x[:, None] - u) + np.square(y[:, None] - v) + np.square(z[:, None] - w)
+    along = np.outer(np.cos(yaw), np.cos(turn)) + np.outer(np.sin(yaw), np.sin(turn))
+    return np.asarray((gap < SAME_DISTANCE**2) & (along > np.cos(SAME_ANGLE)))
+
+
 def _places(pose: Floats, rank: Floats32) -> list[list[int]]:
     """Group poses (H, 4) into places: lists of rows, best pose and best place first."""
     order = np.argsort(-rank, kind="stable")
-    x, y, z, yaw = pose[order].astype(np.float32).T
-    cos, sin = np.cos(yaw), np.sin(yaw)
-    gap = np.square(x[:, None] - x)
-    gap += np.square(y[:, None] - y)
-    gap += np.square(z[:, None] - z)
-    along = np.outer(cos, cos)
-    along += np.outer(sin, sin)
-    same = (gap < SAME_DISTANCE**2) & (along > np.cos(SAME_ANGLE))
+    same = _same(pose[order], pose[order])
     free = np.ones(len(order), dtype=bool)
     alone, rows = (np.count_nonzero(same, axis=1) == 1).tolist(), order.tolist()
     out = []

@@ -82,9 +82,7 @@ class DriftEstimator:
         factors = np.sqrt(np.clip(self._sums / self._metres, _MIN_FACTOR**2, _MAX_FACTOR**2))
         tilt, yaw, position, height = factors.tolist()
         base = self._nominal
-        return Drift(
-            position * base.position, height * base.height, tilt * base.tilt, yaw * base.yaw, yaw * base.turn
-        )  # fmt: skip
+        return Drift(position * base.position, height * base.height, tilt * base.tilt, yaw * base.yaw, yaw * base.turn)
 
     @property
     def tremble(self) -> Floats:
