@@ -164,9 +164,7 @@ def test_reference_system_that_a_file_does_not_have_is_warned_of(map_points, tmp
     assert "ignored" not in capsys.readouterr().err
 
 
-STAGES = (
-    "cleaning, finding normals", "finding the ground", "describing stations", "computing the likelihood field",
-)  # fmt: skip
+STAGES = ("cleaning, finding normals", "finding the ground", "describing stations", "computing the likelihood field")
 
 
 def test_bar_of_a_build_is_one_and_never_goes_back(cloud, capsys, monkeypatch):

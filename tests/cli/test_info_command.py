@@ -57,9 +57,7 @@ def made_up(base_map, drive, wrong=False):
     count, station = len(drive), np.arange(len(drive))
     zeros, wrongs = np.zeros(count), np.full(count, wrong)
     position = base_map.stations[station].astype(np.float64)
-    return module.Ambiguity(
-        station, position, np.array(drive), wrongs, zeros, zeros, zeros, wrongs, 1e-4, 0.3
-    )  # fmt: skip
+    return module.Ambiguity(station, position, np.array(drive), wrongs, zeros, zeros, zeros, wrongs, 1e-4, 0.3)
 
 
 @pytest.mark.slow

@@ -2,9 +2,9 @@
 
 Ground and free space of a scan agree with the map at the right place and at every open place. The rarity of open places
 determines the value of that agreement (:mod:`coview_stream.localization.evidence.likelihood`): next to nothing on a
-plain, up to ten nats in hills. They are counted twice, and the larger share holds: among the places that the search
-scores, hundreds that votes have named, and among poses at random stations of the map, thousands at each keyframe. A
-place has to stay open over the whole drive: poses that are open so far are followed from keyframe to keyframe, and new
+plain, up to ten nats in hills. They are counted twice, and the larger share holds: among a hundred chance places that
+the search has scored, and among poses at random stations of the map, thousands at each keyframe. A place has to stay
+open over the whole drive: poses that are open so far are followed from keyframe to keyframe, and new
 ones are also looked up at the earlier keyframes.
 """
 
@@ -153,9 +153,9 @@ class OpenPlaces:
 
 
 def _ground(scan: ObservedScan) -> ScanPart:
-    """Return the few ground and free points of a scan."""
+    """Return the few ground and free points of a scan; without ground its structure shows what is surveyed."""
     points = scan.few.points
-    return replace(scan.few, points=replace(points, structure=points.structure[:0]))
+    return replace(scan.few, points=replace(points, structure=points.structure[: 0 if len(points.low) else None : 8]))
 
 
 def _odds_against(observed: Floats32, background: Background) -> Floats32:

@@ -46,7 +46,7 @@ _KEPT = 16  # places kept by their evidence, whatever their rank at the newest k
 _KEYFRAMES = 12  # keyframes with observations: the newest and the most spread earlier ones
 _NEWEST = 8  # newest keyframes, searched for a moved part
 _CHANCE = 112  # places that measure the correlation of chance over keyframes
-_RENEWED = 28  # of them at each keyframe: only these are looked up at all earlier keyframes
+_RENEWED = 28  # of them, the oldest, replaced at each keyframe: only new ones are looked up at the earlier ones
 _CHANCE_REACH = 6.0, np.radians(20.0)  # metres, radians from the leader; closer places share its explanation
 BASIN_DISTANCE, BASIN_ANGLE = SAME_DISTANCE, float(np.radians(15.0))
 """Metres and radians from the leader within which registration converges to it."""
@@ -170,6 +170,7 @@ class PlaceScorer:
     Attributes:
         starts: number of starts of the search since a place was accepted.
         area: the only searched part of the map; None for all of it.
+        chance: poses (S, 4) of chance places at the newest keyframe, observations (S, W, 15) there at all keyframes.
     """
 
     def __init__(self, base_map: BaseMap) -> None:
@@ -196,14 +197,13 @@ class PlaceScorer:
         self._followed = Followed.none()
         self._scans: list[ObservedScan] = []
         self._scatter: list[Floats] = []
-        self._chance = np.empty((0, 4)), self._followed.observed  # poses at the newest keyframe, observations at all
+        self.chance = np.empty((0, 4)), self._followed.observed
 
     def go_on_with(self, scans: list[ObservedScan]) -> None:
         """Start with earlier keyframes, oldest first, by which places are compared, too."""
-        self._scans = scans
-        self._scatter = [np.full(4, np.nan)] * len(scans)
+        self._scans, self._scatter = scans, [np.full(4, np.nan)] * len(scans)
         nowhere = np.empty((0, len(scans), NEARBY_VARIANCE.stop), dtype=np.float32)
-        self._followed, self._chance = replace(Followed.none(), observed=nowhere), (np.empty((0, 4)), nowhere)
+        self._followed, self.chance = replace(Followed.none(), observed=nowhere), (np.empty((0, 4)), nowhere)
 
     def score(
         self, hypotheses: Sequence[Hypothesis], votes: Sequence[int], hints: int, scan: ObservedScan, prior: float = 0.0
@@ -261,7 +261,7 @@ class PlaceScorer:
             return []
         at = scan.transforms(part.poses[new])
         newest = np.column_stack([part.shares[new], observe_around(layers, scan.few, part.poses[new])])
-        observed = np.concatenate([self._look_back(at, self._scans[:-1]), newest[:, None]], axis=1)
+        observed = np.concatenate([self.look_back(at, self._scans[:-1]), newest[:, None]], axis=1)
         shares = np.concatenate([leader, observed]).mean(axis=1)
         ratios = log_likelihood_ratios(shares, self._background)
         variances = self._left * ratio_variances(shares, self._background)
@@ -281,7 +281,7 @@ class PlaceScorer:
         self._open.forget(least)
         rest = np.arange(self._followed.observed.shape[1]) != least
         self._followed = replace(self._followed, observed=self._followed.observed[:, rest])
-        self._chance = self._chance[0], self._chance[1][:, rest]
+        self.chance = self.chance[0], self.chance[1][:, rest]
 
     def _around_leader(self) -> list[Hypothesis]:
         if not self._followed.hypotheses:
@@ -340,11 +340,11 @@ class PlaceScorer:
             # a pose refined by more keyframes is better: the best places are looked up again from there
             anew = row < min(_KEPT, count)
             history[~anew] = before.observed[row[~anew]]
-            history[anew] = self._look_back(T[newest[anew]], self._scans)
+            history[anew] = self.look_back(T[newest[anew]], self._scans)
         shares = np.concatenate([history, observed.shares[newest][:, None]], axis=1)
         return Followed([place for _, place in chosen], votes, shares, newest)
 
-    def _look_back(self, T_map_odom: Floats, scans: Sequence[ObservedScan]) -> Floats32:
+    def look_back(self, T_map_odom: Floats, scans: Sequence[ObservedScan]) -> Floats32:
         """Return observations (P, W, 15) of earlier keyframes, oldest first, at new places, corrected for drift."""
         out = np.empty((len(T_map_odom), len(scans), NEARBY_VARIANCE.stop), dtype=np.float32)
         for k, scan in reversed(list(enumerate(scans))):
@@ -359,7 +359,7 @@ class PlaceScorer:
         if not len(mean):
             self._scatter.append(np.full(4, np.nan))
             self._open.clear()
-            self._chance = np.empty((0, 4)), followed.observed
+            self.chance = np.empty((0, 4)), followed.observed
             return np.empty(0), np.empty(0)
         scans = [*self._scans, scan]
         structure, free = np.mean([at.patches for at in scans], axis=0)
@@ -373,7 +373,7 @@ class PlaceScorer:
         anywhere = anywhere if self.area is None else anywhere[self.area.holds(anywhere)]
         height = float(np.median(above)) if len(above) else 0.0
         self._open.look(self._base_map.field, anywhere, self._scans, scan, height)
-        self._chance = sample, over_time = self._over_time(places, observed.shares[first], scan)
+        self.chance = sample, over_time = self._over_time(places, observed.shares[first], scan)
         wrong, elsewhere, leader = np.ones(len(sample), dtype=bool), np.ones(len(sample), dtype=bool), None
         for last in (False, True):
             measured = [row for row in self._scatter if np.isfinite(row).all()] or [self._scatter[-1]]
@@ -395,18 +395,18 @@ class PlaceScorer:
     def _over_time(self, places: Floats, shares: Floats32, scan: ObservedScan) -> tuple[Floats, Floats32]:
         """Return poses (S, 4) of chance places at a keyframe, and observations (S, W, 15) there at all keyframes.
 
-        Most are the last keyframe's, observed once more; the rest are of ``places`` (N, 4), observed as ``shares``.
+        The newest of the last keyframe's are observed once more, others of ``places`` (N, 4), best first, fill up.
         """
-        layers, (poses, history) = self._base_map.field, self._chance
-        poses, history = poses[_RENEWED - _CHANCE :], history[_RENEWED - _CHANCE :]  # the rest are the oldest
-        if self._scans:
-            poses = scan.poses(self._scans[-1].transforms(poses))
+        layers, (poses, history) = self._base_map.field, self.chance
+        poses, history = poses[_RENEWED - _CHANCE :], history[_RENEWED - _CHANCE :]
+        poses = scan.poses(self._scans[-1].transforms(poses)) if self._scans else poses
         again = scan.few.look_up(layers, poses, Move.NEAR)
         now = np.column_stack([again.shares, observe_around(layers, scan.few, again.poses)])
         history = np.concatenate([history, now[:, None]], axis=1)
         others = np.flatnonzero(~_same(places, again.poses).any(axis=1))
         rows = others[np.linspace(0, len(others) - 1, min(len(others), _CHANCE - len(poses))).astype(np.int64)]
-        new = np.concatenate([self._look_back(scan.transforms(places[rows]), self._scans), shares[rows][:, None]], 1)
+        rows = rows[np.argsort(np.arange(len(rows)) % (_CHANCE // _RENEWED), kind="stable")]  # renewed at all scores
+        new = np.concatenate([self.look_back(scan.transforms(places[rows]), self._scans), shares[rows][:, None]], 1)
         return np.concatenate([again.poses, places[rows]]), np.concatenate([history, new])
 
 

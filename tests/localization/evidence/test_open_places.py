@@ -83,6 +83,7 @@ def test_stations_of_a_level_site_are_open_to_a_robot_on_its_ground(world_map, w
 @dataclass(frozen=True)
 class Points:
     structure: tuple = ()
+    low: tuple = (0,)
 
 
 @dataclass(frozen=True)

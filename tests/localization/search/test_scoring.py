@@ -184,6 +184,9 @@ def test_keyframes_that_name_no_place_do_not_shift_the_others(scorer, world_driv
     for k in range(16):
         own = scan_of(world_drive, k % 6)
         assert is_right(scored(scorer, some_places(own), own).places[0], own)
+    again = scorer.look_back(own.transforms(scorer.chance[0]), scorer.scans)
+    apart = np.abs(scorer.chance[1][:, -8:, None] - again[:, None]).mean(axis=(0, 3))  # of the eight newest keyframes
+    assert np.diagonal(apart).max() < 0.7 * apart.mean()
 
 
 def test_two_readings_of_a_scan_are_weighed_by_their_prior(world_map, world_drive):
