@@ -4,8 +4,8 @@ Ground and free space of a scan agree with the map at the right place and at eve
 determines the value of that agreement (:mod:`coview_stream.localization.evidence.likelihood`): next to nothing on a
 plain, up to ten nats in hills. They are counted twice, and the larger share holds: among a hundred chance places that
 the search has scored, and among poses at random stations of the map, thousands at each keyframe. A place has to stay
-open over the whole drive: poses that are open so far are followed from keyframe to keyframe, and new
-ones are also looked up at the earlier keyframes.
+open over the whole drive: poses that are open so far are followed from keyframe to keyframe, and new ones are also
+looked up at the earlier keyframes.
 """
 
 from __future__ import annotations
@@ -116,7 +116,7 @@ class OpenPlaces:
     def share(self, chance: Floats32, background: Background, leader: Floats | None = None) -> Floats:
         """Return the probability (Q, L) that a chance place is open, by nuisance values.
 
-        ``chance`` (P, 7) are observations at scored places more than :data:`SIGHT` from the leader (x, y, ...);
+        ``chance`` (P, 7) are observations at chance places more than :data:`SIGHT` from the leader (x, y, ...);
         stations as near to ``leader`` are ignored, too. ``background`` is that of the other shares.
         """
         self._look_back(background)

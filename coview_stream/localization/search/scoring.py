@@ -395,7 +395,7 @@ class PlaceScorer:
     def _over_time(self, places: Floats, shares: Floats32, scan: ObservedScan) -> tuple[Floats, Floats32]:
         """Return poses (S, 4) of chance places at a keyframe, and observations (S, W, 15) there at all keyframes.
 
-        The newest of the last keyframe's are observed once more, others of ``places`` (N, 4), best first, fill up.
+        They are the last keyframe's newest, and some of ``places`` (N, 4), best first, observed as ``shares`` (N, 15).
         """
         layers, (poses, history) = self._base_map.field, self.chance
         poses, history = poses[_RENEWED - _CHANCE :], history[_RENEWED - _CHANCE :]
