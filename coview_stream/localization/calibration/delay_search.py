@@ -89,12 +89,12 @@ class DelaySearch:
         turned = seen.motion[:3, :3] @ (R @ after[:, :3, :3]).transpose(0, 2, 1)
         twice = turned.transpose(0, 2, 1) - turned  # twice the rotation, for small angles
         tilts, heading = 0.5 * np.stack([twice[:, 1, 2], twice[:, 2, 0]], axis=1), 0.5 * twice[:, 0, 1]
-        spread = seen.spread
+        spread, share = seen.spread, odometry.noise_share(seen.begin - DELAYS, seen.end - DELAYS)
         flat = np.column_stack([seen.motion[:2, 3] - moved[:, :2], heading])
-        squares = np.einsum("di,ij,dj->d", flat, np.linalg.inv(spread), flat)
-        shaken = (tilts**2).sum(axis=1) / (_TILT**2 * spread[2, 2])
-        evidence = -0.5 * (_FREEDOM + 3.0) * np.log1p(squares / _FREEDOM)
-        tilted = -0.5 * (_FREEDOM + 2.0) * np.log1p(shaken / _FREEDOM)
+        squares = np.einsum("di,ij,dj->d", flat, np.linalg.inv(spread), flat) / share
+        shaken = (tilts**2).sum(axis=1) / (_TILT**2 * spread[2, 2]) / share
+        evidence = -0.5 * (_FREEDOM + 3.0) * np.log1p(squares / _FREEDOM) - 1.5 * np.log(share)
+        tilted = -0.5 * (_FREEDOM + 2.0) * np.log1p(shaken / _FREEDOM) - np.log(share)
         evidence += tilted
         fade = math.exp(-float(np.linalg.norm(seen.motion[:3, 3])) / _FADES)
         self.evidence = fade * self.evidence + evidence - evidence.max()

@@ -81,6 +81,7 @@ for _group in (*_GROUPS, GRAVITY):
 _MOTION = np.array([2, 3, 6, 7, 8, 9])  # components that affect a motion
 _FAULTY = {count: np.array(list(itertools.product([False, True], repeat=count))) for count in (1, 5)}
 """Choices (M, groups) of faulty groups."""
+_DELAY, _BUT_DELAY = (np.arange(SIZE) == 6).astype(float), (np.arange(SIZE) != 6).astype(float)
 _FREE = 1e6  # variance, in units of the wide prior's, of a component that is left free
 _GUESSED = 0.9  # probability that a mount with only its angles stated is off by more than a drawing's tolerance
 _STEPPED = 0.5  # probability of a fault where there is evidence of a step
@@ -218,10 +219,11 @@ class CalibrationBelief:
         self.P[:2] *= wider
         self.P[:, :2] *= wider
 
-    def update(self, measured: Floats, H: Floats, R: Floats, right: float = 1.0) -> float:
+    def update(self, measured: Floats, H: Floats, R: Floats, right: float = 1.0, part: Floats | None = None) -> float:
         """Add a measurement ``measured`` = H x + noise of covariance R; return its prior log-likelihood.
 
-        ``right`` is the probability that the measurement is valid; it reduces the gain accordingly.
+        ``right`` is the probability that the measurement is valid; it reduces the gain accordingly. Of the others than
+        ``part`` (10,) of 0 and 1, default all, only the errors count: they are not corrected (Schmidt's filter).
         """
         R = R / right + (1.0 / right - 1.0) * H @ self.P @ H.T
         gap = measured - H @ self.x
@@ -229,6 +231,8 @@ class CalibrationBelief:
         R = R * heavier(distance, len(gap))
         spread = H @ self.P @ H.T + R
         gain = np.linalg.solve(spread, H @ self.P).T
+        if part is not None:
+            gain *= part[:, None]
         self.x = self.x + gain @ gap
         rest = np.eye(SIZE) - gain @ H
         self.P = rest @ self.P @ rest.T + gain @ R @ gain.T
@@ -410,17 +414,18 @@ class CalibrationEstimator:
     def search_delay(self) -> None:
         """Judge the motions that odometry has passed by a second; call it at each frame.
 
-        The state restarts at another delay if they favour it. Where odometry is late the filter learns from motions
-        only here, as odometry at the moments of the clouds was unknown until now.
+        The state restarts at another delay if they favour it. The filter learns the delay only here: a rate at the end
+        of the newest motion contains the noise of its last step of odometry, which would look like a delay of half
+        a step. Rates over both sides of a moment do not. Where odometry is late, it learns the rest here, too.
         """
         judged = self._delays.judge(self.history)
         for belief in filter(None, (self._known, self._supposed)):
             belief.shaking = self._delays.shaking
         for seen, step, rates in judged:
-            if _waits(seen.applied):
-                step[:3, 3] *= 1.0 + seen.applied.scale
-                J = motion_jacobian(step, rates, seen.applied.scale)
-                self._learn_motion(seen.motion, step, J, seen.noise, seen.applied)
+            step[:3, 3] *= 1.0 + seen.applied.scale
+            J = motion_jacobian(step, rates, seen.applied.scale)
+            part = None if _waits(seen.applied) else _DELAY
+            self._learn_motion(seen.motion, step, J, seen.noise, seen.applied, part)
         if judged:
             now, surprise = self.calibration, math.log((1.0 - _CLOCK.share) / _CLOCK.share)
             delay = self._delays.better_than(now.delay, now.sigma_delay, surprise)
@@ -464,21 +469,23 @@ class CalibrationEstimator:
         if first is not None and last is not None:
             self._delays.add(SeenMotion(motion, first.stamp, last.stamp, before, noise, J))
         if first is None or last is None or not _waits(before):
-            self._learn_motion(motion, step, J, noise, before)
+            self._learn_motion(motion, step, J, noise, before, _BUT_DELAY)
         now = self.calibration
         moved = J @ (_motion_part(now) - _motion_part(before))
         t = np.append(step[:2, 3] + moved[:2], (1.0 + now.scale) / (1.0 + before.scale) * step[2, 3])
         return pose_from(exp_so3(np.array([0.0, 0.0, moved[2]])) @ step[:3, :3], t)
 
-    def _learn_motion(self, motion: Pose, step: Pose, J: Floats, noise: Floats, applied: Calibration) -> None:
-        """Add a motion to the beliefs; ``applied`` is the calibration that it and ``step`` were corrected with."""
+    def _learn_motion(
+        self, motion: Pose, step: Pose, J: Floats, noise: Floats, applied: Calibration, part: Floats | None
+    ) -> None:
+        """Add a motion to a ``part`` of the beliefs; ``applied`` is the calibration of it and ``step``."""
         turned = log_so3(motion[:3, :3] @ step[:3, :3].T)
         gap = np.append(motion[:2, 3] - step[:2, 3], turned[2])
         H = np.zeros((3, SIZE))
         H[:, _MOTION] = J
         # clouds levelled by the attitude of another time are bent, which biases their registration as much
         bent = np.diag([turned[1], turned[0], 0.0]) * _HEIGHT
-        self._update(gap + J @ _motion_part(applied), H, noise + bent**2)
+        self._update(gap + J @ _motion_part(applied), H, noise + bent**2, part=part)
 
     def measure_frames(
         self, motion: Pose, step: Pose, variances: Floats, sigmas: Floats, moments: Moments = (None, None),
@@ -505,11 +512,11 @@ class CalibrationEstimator:
         level = self.calibration.T_body_cloud @ inverse(before.T_body_cloud)
         return self.measure_motion(np.eye(4), level @ motion @ inverse(level), step, noise, moments)
 
-    def _update(self, measured: Floats, H: Floats, R: Floats, right: float = 1.0) -> None:
+    def _update(self, measured: Floats, H: Floats, R: Floats, right: float = 1.0, part: Floats | None = None) -> None:
         """Add a measurement to both beliefs, as in :meth:`CalibrationBelief.update`."""
-        likelihood = self._known.update(measured, H, R, right)
+        likelihood = self._known.update(measured, H, R, right, part)
         if self._supposed is not None:
-            ratio = self._supposed.update(measured, H, R, right) - likelihood
+            ratio = self._supposed.update(measured, H, R, right, part) - likelihood
             odds = self._probability * math.exp(min(ratio, 50.0))
             self._probability = odds / (odds + 1.0 - self._probability)
         self._apply()

@@ -96,6 +96,15 @@ class OdometryHistory:
         share = (stamps - known[after - 1]) / (known[after] - known[after - 1])
         return interpolate(poses[after - 1 - low], poses[after - low], share)
 
+    def noise_share(self, begins: Floats, ends: Floats) -> Floats:
+        """Return the variances (N,) of motions from ``begins`` to ``ends`` (N,) by odometry's white noise.
+
+        They are in units of the variance over the same time between stamps: interpolation averages the noise of a step.
+        """
+        known = np.array(self._stamps)
+        parts = np.diff(np.clip(known[None], begins[:, None], ends[:, None]), axis=1)
+        return np.asarray((parts**2 / np.diff(known)).sum(axis=1) / (ends - begins))
+
     def _beyond(self, stamp: float) -> Pose:
         """Return the newest pose (4, 4), extrapolated to a later stamp along an arc."""
         begin = max(bisect_right(self._stamps, self._stamps[-1] - _VELOCITY_OVER) - 1, 0)
