@@ -212,7 +212,7 @@ def score(
                     z = ti.cast(poses[4 * h + 2], ti.f32)
                     yaw = ti.cast(poses[4 * h + 3], ti.f32)
                     step, angle = ti.cast(NEAR_STEP, ti.f32), ti.cast(NEAR_TURN, ti.f32)
-                    if levels > 0:
+                    if levels >= 0:
                         if coarse > 0:
                             at, turn = coarse_best(planes, high, blocks, few, x, y, z, yaw)
                             x += ti.cast(at % WINDOW - REACH, ti.f32)
@@ -245,7 +245,7 @@ def score(
                         yaw += angle * bk
                         step *= 0.5
                         angle *= 0.5
-                    if levels > 0:
+                    if levels >= 0:
                         z += rise(table, down, across, base, surface, lows, x, y, z, yaw, 0.5)
                     c, s = ti.cos(yaw), ti.sin(yaw)
                     inside, close, covered, inside_low, grounded, passed, on = 0, 0, 0, 0, 0, 0, 0

@@ -47,6 +47,8 @@ class Move(Enum):
     """Range within which hypotheses are moved to the best pose around them."""
 
     NONE = "none"
+    HEIGHT = "height"
+    """To the map's ground, along z alone."""
     NEAR = "near"
     """By at most 0.4 m and 0.8 degrees, fine levels only."""
     FAR = "far"
@@ -200,7 +202,8 @@ def field_scores(field: FieldMap, scan: FieldScan, poses: npt.ArrayLike, move: M
     start = as_finite64("poses", poses, None, 4)
     structure, low, free = (as_float32(name, getattr(scan, name), None, 3) for name in ("structure", "low", "free"))
     few = _spread(structure, COARSE), _spread(structure, FINE), _spread(low, LOW)
-    plan = Plan(structure, low, free, *few, 0 if move is Move.NONE else LEVELS, move is Move.FAR)
+    levels = {Move.NONE: -1, Move.HEIGHT: 0}.get(move, LEVELS)
+    plan = Plan(structure, low, free, *few, levels, move is Move.FAR)
     layers = field.layers
     corner = np.array([*field.corner[::-1] * (TILE * CELL), 0.0, 0.0])
     # float32 resolves a tenth of a millimetre at a kilometre from the corner

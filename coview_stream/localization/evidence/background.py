@@ -74,18 +74,21 @@ class Background:
         """Return ``structure`` (P, 4) at places observed (P, 15), by the outcomes around each; (1, 4) without those."""
         return _structure_at(observed, self.structure, self.around)
 
-    def relative_errors_at(self, observed: Floats32) -> Floats:
-        """Return the relative standard errors (P, 4) of :meth:`structure_at`; (1, 4) zeros without ``around``.
+    def relative_errors_at(self, observed: Floats32) -> tuple[Floats, Floats]:
+        """Return the relative standard errors (P, 4) of :meth:`structure_at`, by the poses around and by the places.
 
-        Chance at a place is estimated from few poses, or from none if they lie outside the survey.
+        Chance at a place is estimated from few poses, or from none if they lie outside the survey. Without ``around``
+        both are (1, 4) zeros.
         """
         if self.around is None:
-            return np.zeros((1, 4))
+            return np.zeros((1, 4)), np.zeros((1, 4))
         told = len(_NEIGHBOURS) * observed[:, NEARBY].astype(np.float64)
         count = told.sum(axis=1, keepdims=True) + 1.0  # all places count as one neighbour
         share = (told + self.around) / count
-        variance = (self.within * share * (1.0 - share) * (count - 1.0) + self.between) / count**2
-        return np.asarray(np.sqrt(np.log1p(variance / np.square(share))))  # of a logarithm, as shares are positive
+        own = self.within * share * (1.0 - share) * (count - 1.0)
+        variance = np.log1p((own + self.between) / np.square(count * share))  # of a logarithm, as shares are positive
+        part = own / np.maximum(own + self.between, 1e-12)
+        return np.sqrt(part * variance), np.sqrt((1.0 - part) * variance)
 
 
 def outcomes(observed: Floats32) -> Floats:
@@ -182,13 +185,15 @@ def _passed(observed: Floats32) -> float:
     return float(np.clip(observed[:, Share.PASSED].mean(), *_PASSED)) if len(observed) else 0.05
 
 
-def estimate_background(now: Floats32, variance: Floats, followed: Floats32, most: Most | None = None) -> Background:
+def estimate_background(
+    now: Floats32, variance: Floats, ground: Floats32, most: Most | None = None
+) -> Background:
     """Estimate the background from chance places.
 
     Args:
         now: (N, 7 or 15) the newest keyframe's observations there.
         variance: (4,) mean of :func:`scatter` over the keyframes so far.
-        followed: (K, 7 or 15) mean observations over the keyframes at the followed places.
+        ground: (K, 7 or 15) observations at chance places that do not share the right place's ground.
         most: limits on the number of independent observations.
     """
     most = most or Most()
@@ -199,7 +204,6 @@ def estimate_background(now: Floats32, variance: Floats, followed: Floats32, mos
     high = float(3.0 / (1.0 / number[:3]).sum())
     both = min(high, most.scans * min(_MOST, most.structure)), min(float(number[3]), most.scans * most.free)
     # Beta distribution by the mean and variance of the ground's shares
-    ground = np.concatenate([now, followed])
     shares = np.clip(ground[:, Share.GROUND] / np.maximum(ground[:, Share.COVERED_GROUND], _COVERED), 0.0, 1.0)
     shares = np.concatenate([shares, np.linspace(0.0, 1.0, round(_PSEUDO))])
     mean = float(np.clip(shares.mean(), 0.02, 0.98))
@@ -222,7 +226,7 @@ def observe_with_background(
     poses = scan.poses(T_map_odom)
     observed = scan.few.look_up(field, np.concatenate([poses, chance_places(poses[0])]), kernels.Move.NONE).shares
     places, chance = observed[: len(poses)], observed[len(poses) :]
-    return places, estimate_background(chance, scatter(chance), chance[:0], Most(*scan.patches))
+    return places, estimate_background(chance, scatter(chance), chance, Most(*scan.patches))
 
 
 def chance_places(pose: Floats) -> Floats:

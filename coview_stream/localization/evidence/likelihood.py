@@ -85,8 +85,8 @@ def nuisance_prior(background: Background) -> Floats:
 def ratio_variances(observed: Floats32, background: Background) -> Floats:
     """Return the variances (P,) of log-likelihood ratios by the standard errors of chance at each place.
 
-    They count by the share that unchanged structure explains, at the most probable nuisance values. Outcomes vary
-    together, with the density of the map, so their errors add up.
+    They count by the share that unchanged structure explains, at the most probable nuisance values. From place to place
+    outcomes vary together, with the density of the map, so those errors add up; around one place they hardly do.
     """
     counts = outcomes(observed)
     chance = background.structure_at(observed)[:, None, None]
@@ -96,7 +96,8 @@ def ratio_variances(observed: Floats32, background: Background) -> Floats:
     best = (structure + np.log(nuisance_prior(background).sum(axis=2))).reshape(len(counts), -1).argmax(axis=1)
     unchanged = (right / explained).reshape(len(explained), -1, 4)
     weights = background.number[0] * counts * unchanged[np.minimum(np.arange(len(counts)), len(explained) - 1), best]
-    return np.asarray(np.square((weights * background.relative_errors_at(observed)).sum(axis=1)))
+    own, shared = background.relative_errors_at(observed)
+    return np.asarray(np.square(weights * own).sum(axis=1) + np.square((weights * shared).sum(axis=1)))
 
 
 def log_likelihoods(observed: Floats32, background: Background) -> Floats:

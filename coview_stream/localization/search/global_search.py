@@ -163,7 +163,9 @@ class GlobalSearch:
             scored = self._gathered(scored, leader, scan, request)
             if scored.error < self.config.acceptance.risk:
                 place = scored.places[0]
-                modes = find_modes(place, leader, scan, request, self.base_map, self.config, self._local_maps)
+                modes = find_modes(
+                    place, leader, scan, request, self.base_map, self.config, self._local_maps, reading.scorer.beside
+                )
                 leader, undecided = modes.best, modes.undecided
             if scored.error < 0.5:  # a stated error has to be true even if nothing follows from it
                 scans = [scan] if reading.leans else [*self._scorer.scans[:-1], scan]

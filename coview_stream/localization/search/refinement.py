@@ -2,16 +2,17 @@
 
 A place comprises all poses within two metres of its best pose. Registration converges to the nearest fitting pose;
 where the scan shows little, or the site has changed, that may be a metre off. So registration also starts from poses
-all around, and the results are weighted by the scan's log-likelihood ratio, like places.
+all around, and the results are weighted by the evidence of all keyframes, like places.
 """
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
 
-from coview_kernels import Move, Prior
+from coview_kernels import Prior
 from coview_stream.basemap.basemap import BaseMap
 from coview_stream.config import LocalizerConfig, RegistrationConfig
 from coview_stream.config.localizer import MIN_PAIRS
@@ -29,8 +30,7 @@ from coview_stream.geometry.transforms import (
     transform,
     yaw_of,
 )
-from coview_stream.localization.evidence.background import observe_with_background
-from coview_stream.localization.evidence.likelihood import log_likelihood_ratios
+from coview_stream.localization.evidence.likelihood import odds_of
 from coview_stream.localization.evidence.observation import ObservedScan
 from coview_stream.localization.registration.clouds import LocalMaps, prepare_scan
 from coview_stream.localization.registration.register import gravity_information, register
@@ -43,6 +43,10 @@ _EVERY = 3  # every third point is registered: changes the score by 0.002 and th
 _AROUND = 1.2  # metres to the other starts, slightly beyond the reach of registration
 _DIRECTIONS = 8
 _SAME_METRES, _SAME_RADIANS = 0.3, np.radians(2.0)  # closer poses are one mode
+
+
+Beside = Callable[[Pose, Floats], tuple[Floats, Floats]]
+"""Returns the evidence of poses beside a place: :meth:`PlaceScorer.beside`."""
 
 
 @dataclass(frozen=True)
@@ -107,9 +111,12 @@ def levelled_by_frame(leader: Pose, request: SearchRequest, config: Registration
 
 def find_modes(
     place: Hypothesis, leader: Hypothesis, scan: ObservedScan, request: SearchRequest, base_map: BaseMap,
-    config: LocalizerConfig, local_maps: LocalMaps,
+    config: LocalizerConfig, local_maps: LocalMaps, beside: Beside,
 ) -> Modes:  # fmt: skip
-    """Register a scan from poses around ``leader``, the registered ``place``, and weight the results within it."""
+    """Register a scan from poses around ``leader``, the registered ``place``, and weight the results within it.
+
+    The evidence is that of all keyframes, by ``beside``. The place itself counts, too: registration may have left it.
+    """
     candidates = [leader]
     for angle in 2.0 * np.pi * np.arange(_DIRECTIONS) / _DIRECTIONS:
         start = leader.T_map_odom.copy()
@@ -117,10 +124,11 @@ def find_modes(
         other = register_place(place, scan, base_map, config, local_maps, start)
         if other is not None and same_place(other.T_map_odom, place.T_map_odom, request, BASIN_DISTANCE, BASIN_ANGLE):
             candidates.append(other)
-    poses = np.array([candidate.T_map_odom for candidate in candidates])
-    _, background = observe_with_background(base_map.field, scan, poses[:1])
-    observed = scan.many.look_up(base_map.field, scan.poses(poses), Move.NONE)
-    ratios = log_likelihood_ratios(observed.shares, background)
+    poses = np.array([*(candidate.T_map_odom for candidate in candidates), place.T_map_odom])
+    ratios, variances = beside(place.T_map_odom, poses)
+    top = int(ratios[:-1].argmax())
+    odds = odds_of(ratios[top] - ratios, variances[top] + variances)
+    odds[top] = 1.0
 
     def gap(k: int, other: int) -> tuple[float, float]:
         """Return metres and radians between two poses of the robot."""
@@ -128,10 +136,9 @@ def find_modes(
         return float(np.linalg.norm(step[3:])), float(np.linalg.norm(step[:3]))
 
     modes: list[int] = []
-    for k in np.argsort(-ratios, kind="stable").tolist():
+    for k in [*np.argsort(-ratios[:-1], kind="stable").tolist(), len(candidates)]:
         gaps = (gap(k, mode) for mode in modes)
         if not any(metres < _SAME_METRES and radians < _SAME_RADIANS for metres, radians in gaps):
             modes.append(k)
-    weights = np.exp(ratios[modes] - ratios[modes[0]])
     metres = [gap(k, modes[0])[0] for k in modes]
-    return Modes(candidates[modes[0]], np.array(metres), weights / weights.sum())
+    return Modes(candidates[modes[0]], np.array(metres), odds[modes] / odds[modes].sum())

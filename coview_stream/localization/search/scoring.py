@@ -5,7 +5,8 @@ A hypothesis moves to the best pose within three metres and seven degrees by the
 leader is compared with rivals at their best. The best places are followed: later keyframes observe the map there too,
 and earlier keyframes are looked up at new places, so all places have the same observations. The evidence of a place is
 the log-likelihood ratio of its mean observation against the background of all others
-(:mod:`coview_stream.localization.evidence.likelihood`).
+(:mod:`coview_stream.localization.evidence.likelihood`). The places that lead are moved to one pose for all keyframes
+(:mod:`coview_stream.localization.evidence.paths`); those that meet there are one.
 """
 
 from __future__ import annotations
@@ -18,7 +19,7 @@ import numpy as np
 from coview_kernels import Move
 from coview_stream.basemap.basemap import BaseMap
 from coview_stream.geometry.arrays import Bools, Floats, Floats32, Ints
-from coview_stream.geometry.transforms import Circle
+from coview_stream.geometry.transforms import Circle, Pose
 from coview_stream.localization.evidence.background import (
     NEARBY_VARIANCE,
     Most,
@@ -37,12 +38,15 @@ from coview_stream.localization.evidence.likelihood import (
 from coview_stream.localization.evidence.moved_part import NO_PART, MovedPart
 from coview_stream.localization.evidence.observation import ObservedScan, Share, surroundings
 from coview_stream.localization.evidence.open_places import SIGHT, OpenPlaces
+from coview_stream.localization.evidence.paths import Paths, look_back
 from coview_stream.localization.search.consensus import Hypothesis
 from coview_stream.localization.search.request import SAME_ANGLE, SAME_DISTANCE
 
 _PROMISING = 96  # best hypotheses that are looked up with many points
 _FOLLOWED = 64  # best places that the next keyframe observes again
 _KEPT = 16  # places kept by their evidence, whatever their rank at the newest keyframe
+_SETTLED = 8  # best places that are moved to one pose for all keyframes
+_BEHIND = 12.0  # log-odds against the first place from which on a place does not count
 _KEYFRAMES = 12  # keyframes with observations: the newest and the most spread earlier ones
 _NEWEST = 8  # newest keyframes, searched for a moved part
 _CHANCE = 112  # places that measure the correlation of chance over keyframes
@@ -224,11 +228,14 @@ class PlaceScorer:
         followed = self._follow(scan, observed, all_hypotheses, ranks, hints)
         first = observed.first
         ratios, variances = self._evidence(followed, observed, scan)
+        if len(self._scans) and len(ratios):
+            followed, ratios, variances = self._settled(followed, ratios, variances, scan)
         chances = posterior(ratios + prior, followed.votes, len(first), self.starts, variances)
         order = np.lexsort((np.log1p(followed.votes) - ratios, -chances.place))
         chances = replace(chances, place=chances.place[order])
         self._scans.append(scan)
         self._followed = followed = followed[order]
+        self._leader = ratios[order[:1]], variances[order[:1]]
         self._thin_out()
         numbers = zip(ratios[order].tolist(), chances.place.tolist(), followed.newest, strict=True)
         places = [
@@ -238,7 +245,7 @@ class PlaceScorer:
         rivals = Rivals(scan.transforms(observed.poses[first]), observed.scores[first], observed.inside[first])
         if not places:
             return Scored(rivals, places)
-        poses = observed.poses[followed.newest]
+        poses = scan.poses(np.array([place.T_map_odom for place in places]))
         elsewhere = _apart(poses, poses[0], BASIN_DISTANCE, BASIN_ANGLE)
         second = next((place for place, other in zip(places, elsewhere, strict=True) if other), None)
         by_chance = expected_by_chance(places[0].ratio, len(first))
@@ -249,7 +256,7 @@ class PlaceScorer:
 
         They have the leader's prior probability, as no vote has ranked them, and the background of the newest keyframe.
         """
-        leader, layers = self._followed.observed[:1], self._base_map.field
+        layers, scans = self._base_map.field, self._scans
         known = scan.poses(np.array([place.T_map_odom for place in self._followed.hypotheses]))
         part = scan.many.look_up(layers, scan.few.look_up(layers, scan.poses(T_map_odom), Move.FAR).poses, Move.NEAR)
         new = [
@@ -261,15 +268,28 @@ class PlaceScorer:
             return []
         at = scan.transforms(part.poses[new])
         newest = np.column_stack([part.shares[new], observe_around(layers, scan.few, part.poses[new])])
-        observed = np.concatenate([self.look_back(at, self._scans[:-1]), newest[:, None]], axis=1)
-        shares = np.concatenate([leader, observed]).mean(axis=1)
-        ratios = log_likelihood_ratios(shares, self._background)
-        variances = self._left * ratio_variances(shares, self._background)
-        odds = odds_of(ratios[0] - ratios[1:], variances[0] + variances[1:])
+        observed = np.concatenate([look_back(layers, scans[:-1], at)[0], newest[:, None]], axis=1).mean(axis=1)
+        ratios = log_likelihood_ratios(observed, self._background)
+        leader, variance = self._leader
+        odds = odds_of(leader - ratios, variance + self._left * ratio_variances(observed, self._background))
         return [
             Hypothesis(T, score=float(score), ratio=float(ratio), probability=float(each))
-            for T, score, ratio, each in zip(at, part.scores[new], ratios[1:], odds, strict=True)
+            for T, score, ratio, each in zip(at, part.scores[new], ratios, odds, strict=True)
         ]
+
+    def beside(self, place: Pose, others: Floats) -> tuple[Floats, Floats]:
+        """Return log-likelihood ratios (M,) of poses ``others`` (M, 4, 4) beside a place, and their variances.
+
+        All keyframes follow the path of ``place`` (4, 4); all are ``T_map_odom``.
+        """
+        paths = Paths.of(self._base_map.field, self._scans, place[None])
+        moves = self._scans[-1].poses(others) - paths.poses[:, -1]
+        moves[:, 2], moves[:, 3] = 0.0, (moves[:, 3] + np.pi) % (2.0 * np.pi) - np.pi
+        observed = paths.observe(moves[None], many=True)[0]
+        return (
+            log_likelihood_ratios(observed, self._background),
+            self._left * ratio_variances(observed, self._background),
+        )
 
     def _thin_out(self) -> None:
         """Drop the keyframe closest to its neighbours if there are too many; the first and the newest stay."""
@@ -340,18 +360,35 @@ class PlaceScorer:
             # a pose refined by more keyframes is better: the best places are looked up again from there
             anew = row < min(_KEPT, count)
             history[~anew] = before.observed[row[~anew]]
-            history[anew] = self.look_back(T[newest[anew]], self._scans)
+            history[anew] = look_back(self._base_map.field, self._scans, T[newest[anew]])[0]
         shares = np.concatenate([history, observed.shares[newest][:, None]], axis=1)
         return Followed([place for _, place in chosen], votes, shares, newest)
 
-    def look_back(self, T_map_odom: Floats, scans: Sequence[ObservedScan]) -> Floats32:
-        """Return observations (P, W, 15) of earlier keyframes, oldest first, at new places, corrected for drift."""
-        out = np.empty((len(T_map_odom), len(scans), NEARBY_VARIANCE.stop), dtype=np.float32)
-        for k, scan in reversed(list(enumerate(scans))):
-            observed = scan.few.look_up(self._base_map.field, scan.poses(T_map_odom), Move.NEAR)
-            around = observe_around(self._base_map.field, scan.few, observed.poses)
-            out[:, k], T_map_odom = np.column_stack([observed.shares, around]), scan.transforms(observed.poses)
-        return out
+    def _settled(
+        self, followed: Followed, ratios: Floats, variances: Floats, scan: ObservedScan
+    ) -> tuple[Followed, Floats, Floats]:
+        """Move the places that lead to one pose for all keyframes; return the distinct places and their evidence."""
+        order = np.argsort(np.log1p(followed.votes) - ratios, kind="stable")
+        top = order[:_SETTLED]
+        top = top[ratios[top] > ratios[top[0]] - _BEHIND]
+        places, ratios, variances = list(followed.hypotheses), ratios.copy(), variances.copy()
+        T = np.array([place.T_map_odom for place in places])
+        paths = Paths.of(self._base_map.field, [*self._scans, scan], T[top])
+        found = paths.settled(self._background)
+        moved = found.moves[:, :2].any(axis=1)  # else the pose by the newest keyframe is finer
+        T[top[moved]] = scan.transforms((paths.poses[:, -1] + found.moves)[moved])
+        better = found.ratios > ratios[top]
+        ratios[top[better]] = found.ratios[better]
+        variances[top[better]] = (self._left * ratio_variances(found.observed, self._background))[better]
+        poses = scan.poses(T)
+        order = np.argsort(np.log1p(followed.votes) - ratios, kind="stable")
+        same = _same(poses[order], poses[order])
+        kept = np.flatnonzero(~np.tril(same, -1).any(axis=1))
+        votes = followed.votes.copy()
+        votes[order[kept]] = [followed.votes[order[row]].min() for row in same[kept]]
+        places = [replace(place, T_map_odom=at) for place, at in zip(places, T, strict=True)]
+        distinct = replace(followed, hypotheses=places, votes=votes)[order[kept]]
+        return distinct, ratios[order[kept]], variances[order[kept]]
 
     def _evidence(self, followed: Followed, observed: _Observed, scan: ObservedScan) -> tuple[Floats, Floats]:
         """Return log-likelihood ratios (P,) against the places that are not around the leader, and their variances."""
@@ -366,6 +403,7 @@ class PlaceScorer:
         most = Most(float(structure), float(free), surroundings(scans))
         poses, places = observed.poses[followed.newest], observed.poses[first]
         chance, distant = np.ones(len(first), dtype=bool), np.ones(len(mean), dtype=bool)
+        grounds, near = np.concatenate([observed.shares[first], mean]), np.zeros(len(first) + len(mean), dtype=bool)
         self._scatter.append(scatter(observed.shares[first]))
         stations = [-1 if place.station is None else place.station for place in followed.hypotheses]
         above = (poses[:, 2] - self._base_map.stations[stations, 2])[np.array(stations) >= 0]
@@ -379,7 +417,10 @@ class PlaceScorer:
             measured = [row for row in self._scatter if np.isfinite(row).all()] or [self._scatter[-1]]
             left = left_in_mean(over_time[wrong])
             spread = np.mean(measured, axis=0) * left
-            background = estimate_background(observed.shares[first][chance], spread, mean[distant], most)
+            wide = np.concatenate([chance, distant])
+            # ground near the leader counts only where there is little elsewhere
+            ground = grounds[wide][np.argsort(near[wide], kind="stable")[: max(_FOLLOWED, int((wide & ~near).sum()))]]
+            background = estimate_background(observed.shares[first][chance], spread, ground, most)
             background = replace(background, open=self._open.share(over_time[elsewhere].mean(1), background, leader))
             ratios = log_likelihood_ratios(mean, background)
             if last:
@@ -388,6 +429,7 @@ class PlaceScorer:
             elsewhere = _apart(sample, leader, SIGHT, np.pi)
             # places around the leader share its explanation
             chance, distant, wrong = (_apart(at, leader, *_CHANCE_REACH) for at in (places, poses, sample))
+            near = ~_apart(np.concatenate([places, poses]), leader, SIGHT, np.pi)
             self._scatter[-1] = scatter(observed.shares[first][chance])
         self._background, self._left = background, float(left[:3].mean())
         return ratios, self._left * ratio_variances(mean, background)  # shrinks like the scatter
@@ -406,7 +448,8 @@ class PlaceScorer:
         others = np.flatnonzero(~_same(places, again.poses).any(axis=1))
         rows = others[np.linspace(0, len(others) - 1, min(len(others), _CHANCE - len(poses))).astype(np.int64)]
         rows = rows[np.argsort(np.arange(len(rows)) % (_CHANCE // _RENEWED), kind="stable")]  # renewed at all scores
-        new = np.concatenate([self.look_back(scan.transforms(places[rows]), self._scans), shares[rows][:, None]], 1)
+        earlier = look_back(layers, self._scans, scan.transforms(places[rows]))[0]
+        new = np.concatenate([earlier, shares[rows][:, None]], axis=1)
         return np.concatenate([again.poses, places[rows]]), np.concatenate([history, new])
 
 

@@ -40,7 +40,7 @@ class FieldLayers(NamedTuple):
 
 
 class Plan(NamedTuple):
-    """A scan, its parts for the levels, the number of fine levels, and whether a coarse level comes first."""
+    """A scan, its parts for the levels, the number of fine levels (-1: no move at all), and whether a coarse level comes first."""
 
     structure: F32
     low: F32
@@ -60,7 +60,7 @@ def field_scores(layers: FieldLayers, plan: Plan, start: F64) -> tuple[F64, I32]
     """
     poses, counts = start.copy(), np.zeros((len(start), 7), dtype=np.int32)
     for pose, count in zip(poses, counts, strict=True):
-        if plan.levels:
+        if plan.levels >= 0:
             _refine(layers, plan, pose)
         count[:] = _counts(layers, plan, pose)
     return poses, counts
