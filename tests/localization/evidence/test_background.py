@@ -29,7 +29,7 @@ NOTHING = np.empty((0, len(Share)), dtype=np.float32)
 def background_of(places):
     """Of places (P, W, 7) that were followed over W keyframes."""
     spread = np.mean([scatter(places[:, k]) for k in range(places.shape[1])], axis=0)
-    return estimate_background(places[:, -1], spread, places.mean(axis=1))
+    return estimate_background(places[:, -1], spread, places[:, -1])
 
 
 @pytest.fixture
@@ -169,7 +169,7 @@ def test_background_is_what_the_places_around_the_first_pose_explain(world_map, 
     both = np.stack([T_MAP_ODOM, away])
     observed, background = observe_with_background(world_map.field, seen, both)
     chance = seen.few.look_up(world_map.field, places_around(seen.poses(both)[0]), Move.NONE).shares
-    expected = estimate_background(chance, scatter(chance), chance[:0], Most(*seen.patches))
+    expected = estimate_background(chance, scatter(chance), chance, Most(*seen.patches))
     np.testing.assert_allclose(background.structure, expected.structure)
     assert background.passed == pytest.approx(expected.passed)
     assert background.ground == pytest.approx(expected.ground)
@@ -194,7 +194,7 @@ def rich_and_bare(rng, number=40, error=0.0):
 
 def test_chance_at_a_place_is_told_by_the_map_around_it(rng):
     places = rich_and_bare(rng)
-    known, unknown = (estimate_background(rows, scatter(rows), rows[:0]) for rows in (places, places[:, : len(Share)]))
+    known, unknown = (estimate_background(rows, scatter(rows), rows) for rows in (places, places[:, : len(Share)]))
     at = known.structure_at(places)
     np.testing.assert_allclose(at[:2, 2], (0.05, 0.6), atol=0.06)
     np.testing.assert_allclose(at.sum(axis=1), 1.0)
@@ -213,7 +213,7 @@ def test_evidence_is_as_uncertain_as_chance_at_its_place(rng):
     right[:, [Share.ON, Share.NEAR, Share.EDGE]] = 0.5, 0.7, 0.3
     right[1, NEARBY] = 0.0, 0.0, 0.0, 1.0
     right[2, NEARBY] = 0.0
-    known = estimate_background(vague, scatter(vague), vague[:0])
+    known = estimate_background(vague, scatter(vague), vague)
     told, bare, outside = ratio_variances(right, known)
     assert told > 1.0
     assert told > 5.0 * np.median(ratio_variances(vague, known))

@@ -16,6 +16,7 @@ from coview_stream.localization.registration.clouds import LocalMaps
 from coview_stream.localization.search import refinement
 from coview_stream.localization.search.refinement import Modes, find_modes
 from coview_stream.localization.search.request import SearchRequest
+from coview_stream.localization.search.scoring import PlaceScorer
 
 CONFIG = LocalizerConfig()
 T_MAP_ODOM = pose_from(rot_z(0.9), [14.0, -6.0, 0.4])
@@ -44,7 +45,18 @@ def look(row_map, points, x, reach, start):
     scan = observed(cloud, T_odom_body)
     request = SearchRequest(0.0, T_odom_body, NOTHING, NOTHING, NOTHING, 0.0, (0, 0))
     named = place(1.0, pose_from(np.eye(3), [start, 0.0, 0.0]) @ T_MAP_ODOM)
-    return find_modes(named, candidate(named), scan, request, row_map, CONFIG, LocalMaps(row_map, 50.0))
+    scorer, maps = PlaceScorer(row_map), LocalMaps(row_map, 50.0)
+    scorer.score([named, *elsewhere(scan)], range(31), 0, scan)
+    return find_modes(named, candidate(named), scan, request, row_map, CONFIG, maps, scorer.beside)
+
+
+def elsewhere(scan):
+    """Thirty wrong places, for the background."""
+    rng = np.random.default_rng(3)
+    turns = [rot_z(angle) for angle in rng.uniform(-np.pi, np.pi, 30)]
+    shifts = np.column_stack([rng.uniform(-20, 20, (30, 2)), np.zeros(30)])
+    poses = zip(turns, T_MAP_ODOM[:3, 3] + shifts, strict=True)
+    return [place(1.0, pose_from(turn, at)) for turn, at in poses]
 
 
 def off(found: Modes) -> float:

@@ -11,6 +11,7 @@ from coview_kernels import Move
 from coview_stream.config import LocalizerConfig
 from coview_stream.geometry.transforms import inverse, pose_from, rot_z, rotation_angle
 from coview_stream.localization.evidence.observation import ObservedScan
+from coview_stream.localization.evidence.paths import look_back
 from coview_stream.localization.registration.clouds import prepare_scan
 from coview_stream.localization.search.consensus import Hypothesis
 from coview_stream.localization.search.scoring import PlaceScorer, Rivals, Scored
@@ -177,14 +178,14 @@ def test_keyframes_far_apart_are_kept(world_map, world_drive):
 
 
 @pytest.mark.slow
-def test_keyframes_that_name_no_place_do_not_shift_the_others(scorer, world_drive):
+def test_keyframes_that_name_no_place_do_not_shift_the_others(scorer, world_map, world_drive):
     """An open field first: what is kept of each keyframe stays that keyframe's when the oldest are forgotten."""
     for k in range(3):
         assert not scored(scorer, [], scan_of(world_drive, k)).places
     for k in range(16):
         own = scan_of(world_drive, k % 6)
         assert is_right(scored(scorer, some_places(own), own).places[0], own)
-    again = scorer.look_back(own.transforms(scorer.chance[0]), scorer.scans)
+    again, _ = look_back(world_map.field, scorer.scans, own.transforms(scorer.chance[0]))
     apart = np.abs(scorer.chance[1][:, -8:, None] - again[:, None]).mean(axis=(0, 3))  # of the eight newest keyframes
     assert np.diagonal(apart).max() < 0.7 * apart.mean()
 
