@@ -91,7 +91,12 @@ def test_kernel_agrees_with_its_numpy_twin(scene: Scene):
     starts = np.vstack([pose, others])
     corner = np.array([*field.corner[::-1] * 16.0, 0, 0])
     Move = kernels.Move
-    for move, levels, coarse in ((Move.NONE, -1, False), (Move.HEIGHT, 0, False), (Move.FAR, 2, True), (Move.NEAR, 2, False)):
+    for move, levels, coarse in (
+        (Move.NONE, -1, False),
+        (Move.HEIGHT, 0, False),
+        (Move.FAR, 2, True),
+        (Move.NEAR, 2, False),
+    ):
         poses, counts = reference.field_scores(field.layers, plan_of(scan, levels, coarse), starts - corner)
         found = kernels.field_scores(field, scan, starts, move)
         # a point on a cell's edge may round to either side; a few of a thousand do

@@ -82,7 +82,7 @@ class DelaySearch:
         return judged
 
     def _judge(self, seen: SeenMotion, odometry: OdometryHistory) -> None:
-        """Compare a motion with odometry at each delay."""
+        """Compare a motion with odometry at each delay, by the noise that interpolation leaves of odometry's."""
         before, after = odometry.all_at(seen.begin - DELAYS), odometry.all_at(seen.end - DELAYS)
         R = before[:, :3, :3].transpose(0, 2, 1)
         moved = (1.0 + seen.applied.scale) * np.einsum("dij,dj->di", R, after[:, :3, 3] - before[:, :3, 3])
@@ -93,8 +93,8 @@ class DelaySearch:
         flat = np.column_stack([seen.motion[:2, 3] - moved[:, :2], heading])
         squares = np.einsum("di,ij,dj->d", flat, np.linalg.inv(spread), flat) / share
         shaken = (tilts**2).sum(axis=1) / (_TILT**2 * spread[2, 2]) / share
-        evidence = -0.5 * (_FREEDOM + 3.0) * np.log1p(squares / _FREEDOM) - 1.5 * np.log(share)
-        tilted = -0.5 * (_FREEDOM + 2.0) * np.log1p(shaken / _FREEDOM) - np.log(share)
+        evidence = -0.5 * (_FREEDOM + 3.0) * np.log1p(squares / _FREEDOM)
+        tilted = -0.5 * (_FREEDOM + 2.0) * np.log1p(shaken / _FREEDOM)
         evidence += tilted
         fade = math.exp(-float(np.linalg.norm(seen.motion[:3, 3])) / _FADES)
         self.evidence = fade * self.evidence + evidence - evidence.max()

@@ -185,9 +185,7 @@ def _passed(observed: Floats32) -> float:
     return float(np.clip(observed[:, Share.PASSED].mean(), *_PASSED)) if len(observed) else 0.05
 
 
-def estimate_background(
-    now: Floats32, variance: Floats, ground: Floats32, most: Most | None = None
-) -> Background:
+def estimate_background(now: Floats32, variance: Floats, ground: Floats32, most: Most | None = None) -> Background:
     """Estimate the background from chance places.
 
     Args:

@@ -26,7 +26,10 @@ from coview_stream.localization.evidence.observation import ObservedScan, Share
 _STEP, _REACH = 1.0, 2  # metres of a shift, and steps to each side: the basin of a place
 _TURN = np.radians(1.0)
 _DRIFT = 0.02, 0.05  # of odometry between keyframes, one sigma: share of the distance, and metres
-_SCATTER, _WEIGHT = 0.2, 4.0  # metres of a pose about its path, of half-metre cells, and its weight in degrees of freedom
+_SCATTER, _WEIGHT = (
+    0.2,
+    4.0,
+)  # metres of a pose about its path, of half-metre cells, and its weight in degrees of freedom
 
 
 def _grid(reach: int) -> Floats:
@@ -52,7 +55,7 @@ def look_back(
 ) -> tuple[Floats32, Floats]:  # fmt: skip
     """Return observations (P, W, 15) of scans, oldest first, at places ``T_map_odom`` (P, 4, 4), and poses (P, W, 4).
 
-    Each scan begins at the pose of the next newer one, which undoes odometry's drift, and moves to the most hits nearby.
+    Each scan begins at the pose of the next newer one, which undoes odometry's drift, and moves to most hits nearby.
     """
     width = len(Share) + 8
     observed = np.empty((len(T_map_odom), len(scans), width), dtype=np.float32)
@@ -71,18 +74,17 @@ class Paths:
     field: kernels.FieldMap
     scans: Sequence[ObservedScan]  # (W) of the keyframes
     poses: Floats  # (P, W, 4)
-    around: Floats32  # (P, 8) outcomes around the poses and their variances, means over the keyframes
+    around: Floats32  # (P, 8) outcomes around the places and their variances, means over the keyframes
 
     @classmethod
-    def of(cls, field: kernels.FieldMap, scans: Sequence[ObservedScan], T_map_odom: Floats) -> Paths:
-        """Return the paths of places ``T_map_odom`` (P, 4, 4) at the newest keyframe."""
-        straight = np.stack([scan.poses(T_map_odom) for scan in scans], axis=1)
-        offsets = np.zeros_like(straight)
-        offsets[:, :-1] = look_back(field, scans[:-1], T_map_odom)[1] - straight[:, :-1]
+    def of(cls, field: kernels.FieldMap, scans: Sequence[ObservedScan], poses: Floats, observed: Floats32) -> Paths:
+        """Smooth the poses (P, W, 4) of places with observations (P, W, 15), as :func:`look_back` returns them."""
+        newest = scans[-1].transforms(poses[:, -1])
+        straight = np.stack([scan.poses(newest) for scan in scans], axis=1)
+        offsets = poses - straight
         offsets[:, :, 3] = (offsets[:, :, 3] + np.pi) % (2.0 * np.pi) - np.pi
-        poses = straight + smoothed(offsets, np.array([scan.body for scan in scans]))
-        each = [observe_around(field, scan.few, poses[:, k]) for k, scan in enumerate(scans)]
-        return cls(field, scans, poses, np.mean(each, axis=0))
+        smooth = straight + smoothed(offsets, np.array([scan.body for scan in scans]))
+        return cls(field, scans, smooth, observed[:, :, len(Share) :].mean(axis=1))
 
     def observe(self, moves: Floats, many: bool = False) -> Floats32:
         """Return mean observations (P, M, 15) over the keyframes with the paths moved by ``moves`` (P, M, 4)."""

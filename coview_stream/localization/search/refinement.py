@@ -45,7 +45,7 @@ _DIRECTIONS = 8
 _SAME_METRES, _SAME_RADIANS = 0.3, np.radians(2.0)  # closer poses are one mode
 
 
-Beside = Callable[[Pose, Floats], tuple[Floats, Floats]]
+Beside = Callable[[Floats], tuple[Floats, Floats]]
 """Returns the evidence of poses beside a place: :meth:`PlaceScorer.beside`."""
 
 
@@ -125,7 +125,7 @@ def find_modes(
         if other is not None and same_place(other.T_map_odom, place.T_map_odom, request, BASIN_DISTANCE, BASIN_ANGLE):
             candidates.append(other)
     poses = np.array([*(candidate.T_map_odom for candidate in candidates), place.T_map_odom])
-    ratios, variances = beside(place.T_map_odom, poses)
+    ratios, variances = beside(poses)
     top = int(ratios[:-1].argmax())
     odds = odds_of(ratios[top] - ratios, variances[top] + variances)
     odds[top] = 1.0

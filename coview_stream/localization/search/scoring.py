@@ -19,7 +19,7 @@ import numpy as np
 from coview_kernels import Move
 from coview_stream.basemap.basemap import BaseMap
 from coview_stream.geometry.arrays import Bools, Floats, Floats32, Ints
-from coview_stream.geometry.transforms import Circle, Pose
+from coview_stream.geometry.transforms import Circle
 from coview_stream.localization.evidence.background import (
     NEARBY_VARIANCE,
     Most,
@@ -135,17 +135,18 @@ class Followed:
     hypotheses: list[Hypothesis]  # at the newest keyframe
     votes: Ints  # (P,) rank of each in the newest votes that named it, from 0
     observed: Floats32  # (P, W, 15) observations at and around the places at the keyframes, oldest first
+    poses: Floats  # (P, W, 4) poses of these observations
     newest: Ints  # (P,) rows among the newest keyframe's poses
 
     @classmethod
     def none(cls) -> Followed:
         """Return no places, at no keyframes."""
         nothing = np.empty(0, dtype=np.int64)
-        return cls([], nothing, np.empty((0, 0, NEARBY_VARIANCE.stop), dtype=np.float32), nothing)
+        return cls([], nothing, np.empty((0, 0, NEARBY_VARIANCE.stop), dtype=np.float32), np.empty((0, 0, 4)), nothing)
 
     def __getitem__(self, order: Ints) -> Followed:
         hypotheses = [self.hypotheses[k] for k in order]
-        return Followed(hypotheses, self.votes[order], self.observed[order], self.newest[order])
+        return Followed(hypotheses, self.votes[order], self.observed[order], self.poses[order], self.newest[order])
 
 
 @dataclass(frozen=True)
@@ -207,7 +208,8 @@ class PlaceScorer:
         """Start with earlier keyframes, oldest first, by which places are compared, too."""
         self._scans, self._scatter = scans, [np.full(4, np.nan)] * len(scans)
         nowhere = np.empty((0, len(scans), NEARBY_VARIANCE.stop), dtype=np.float32)
-        self._followed, self.chance = replace(Followed.none(), observed=nowhere), (np.empty((0, 4)), nowhere)
+        none = replace(Followed.none(), observed=nowhere, poses=np.empty((0, len(scans), 4)))
+        self._followed, self.chance = none, (np.empty((0, 4)), nowhere)
 
     def score(
         self, hypotheses: Sequence[Hypothesis], votes: Sequence[int], hints: int, scan: ObservedScan, prior: float = 0.0
@@ -277,19 +279,20 @@ class PlaceScorer:
             for T, score, ratio, each in zip(at, part.scores[new], ratios, odds, strict=True)
         ]
 
-    def beside(self, place: Pose, others: Floats) -> tuple[Floats, Floats]:
-        """Return log-likelihood ratios (M,) of poses ``others`` (M, 4, 4) beside a place, and their variances.
+    def beside(self, T_map_odom: Floats) -> tuple[Floats, Floats]:
+        """Return log-likelihood ratios (M,) of poses (M, 4, 4) beside the most probable place, and their variances.
 
-        All keyframes follow the path of ``place`` (4, 4); all are ``T_map_odom``.
+        At all keyframes they lie equally far from the place's path.
         """
-        paths = Paths.of(self._base_map.field, self._scans, place[None])
-        moves = self._scans[-1].poses(others) - paths.poses[:, -1]
+        layers, first = self._base_map.field, self._followed[np.arange(1)]
+        newest = self._scans[-1].poses(first.hypotheses[0].T_map_odom[None])
+        _, poses = look_back(layers, self._scans[:-1], self._scans[-1].transforms(newest))
+        paths = Paths.of(layers, self._scans, np.concatenate([poses, newest[:, None]], axis=1), first.observed)
+        moves = self._scans[-1].poses(T_map_odom) - paths.poses[:, -1]
         moves[:, 2], moves[:, 3] = 0.0, (moves[:, 3] + np.pi) % (2.0 * np.pi) - np.pi
         observed = paths.observe(moves[None], many=True)[0]
-        return (
-            log_likelihood_ratios(observed, self._background),
-            self._left * ratio_variances(observed, self._background),
-        )
+        variances = ratio_variances(observed, self._background)
+        return log_likelihood_ratios(observed, self._background), self._left * variances
 
     def _thin_out(self) -> None:
         """Drop the keyframe closest to its neighbours if there are too many; the first and the newest stay."""
@@ -300,7 +303,8 @@ class PlaceScorer:
         del self._scans[least], self._scatter[least]
         self._open.forget(least)
         rest = np.arange(self._followed.observed.shape[1]) != least
-        self._followed = replace(self._followed, observed=self._followed.observed[:, rest])
+        followed = self._followed
+        self._followed = replace(followed, observed=followed.observed[:, rest], poses=followed.poses[:, rest])
         self.chance = self.chance[0], self.chance[1][:, rest]
 
     def _around_leader(self) -> list[Hypothesis]:
@@ -355,14 +359,16 @@ class PlaceScorer:
         rank, last = ranks.tolist(), len(observed.groups) - 1
         votes = np.array([min(last, *(rank[row] for row in group)) for group, _ in chosen], dtype=np.int64)
         history = np.empty((len(chosen), len(self._scans), NEARBY_VARIANCE.stop), dtype=np.float32)
+        poses = np.empty((len(chosen), len(self._scans), 4))
         row = np.array(origins, dtype=np.int64)
         if len(self._scans):
             # a pose refined by more keyframes is better: the best places are looked up again from there
             anew = row < min(_KEPT, count)
-            history[~anew] = before.observed[row[~anew]]
-            history[anew] = look_back(self._base_map.field, self._scans, T[newest[anew]])[0]
+            history[~anew], poses[~anew] = before.observed[row[~anew]], before.poses[row[~anew]]
+            history[anew], poses[anew] = look_back(self._base_map.field, self._scans, T[newest[anew]])
         shares = np.concatenate([history, observed.shares[newest][:, None]], axis=1)
-        return Followed([place for _, place in chosen], votes, shares, newest)
+        poses = np.concatenate([poses, observed.poses[newest][:, None]], axis=1)
+        return Followed([place for _, place in chosen], votes, shares, poses, newest)
 
     def _settled(
         self, followed: Followed, ratios: Floats, variances: Floats, scan: ObservedScan
@@ -373,7 +379,7 @@ class PlaceScorer:
         top = top[ratios[top] > ratios[top[0]] - _BEHIND]
         places, ratios, variances = list(followed.hypotheses), ratios.copy(), variances.copy()
         T = np.array([place.T_map_odom for place in places])
-        paths = Paths.of(self._base_map.field, [*self._scans, scan], T[top])
+        paths = Paths.of(self._base_map.field, [*self._scans, scan], followed.poses[top], followed.observed[top])
         found = paths.settled(self._background)
         moved = found.moves[:, :2].any(axis=1)  # else the pose by the newest keyframe is finer
         T[top[moved]] = scan.transforms((paths.poses[:, -1] + found.moves)[moved])

@@ -40,7 +40,7 @@ class FieldLayers(NamedTuple):
 
 
 class Plan(NamedTuple):
-    """A scan, its parts for the levels, the number of fine levels (-1: no move at all), and whether a coarse level comes first."""
+    """A scan, its parts for the levels, the number of fine levels (-1: no move), whether a coarse one comes first."""
 
     structure: F32
     low: F32

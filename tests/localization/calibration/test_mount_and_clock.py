@@ -44,23 +44,30 @@ class Drive(NamedTuple):
     poses: np.ndarray
     delay: float = 0.0
     mount: np.ndarray = np.eye(4)
+    noise: float = 0.0  # radians of odometry's heading at each of its steps
+    every: int = 10  # tenths of a second between registrations
+    seed: int = 1
 
     def learnt(self, earlier=None, stated=0.0, drawn=True):
         """Return the estimator after the drive."""
         estimator, correction = CalibrationEstimator(cloud_delay=stated, mount_drawn=drawn), OdometryCorrection()
-        rng = np.random.default_rng(1)
+        rng = np.random.default_rng(self.seed)
         history = estimator.history
         if earlier is not None:
             estimator.learn(earlier)
         newest = marked = None
+        T_odom = before_it = self.at(2.0 - max(-self.delay, 0.0))
         for stamp in np.arange(2.0, 58.0, 0.1):
             late = estimator.calibration.delay
             before = None if newest is None else history.at(newest - late)
-            history.add(stamp, self.at(stamp - max(-self.delay, 0.0)))
+            now = self.at(stamp - max(-self.delay, 0.0))
+            turned = rot_z(rng.normal(0.0, self.noise)) if self.noise else np.eye(3)
+            T_odom, before_it = T_odom @ inverse(before_it) @ now @ pose_from(turned, np.zeros(3)), now
+            history.add(stamp, T_odom)
             newest = stamp
             T = correction.correct(history.at(stamp - late), estimator.calibration, before)
             estimator.search_delay()
-            if round(10 * stamp) % 10:
+            if round(10 * stamp) % self.every:
                 continue
             noise = exp_se3(rng.normal(0.0, [0, 0, HEADING, POSITION, POSITION, 0]))
             T_cloud = self.at(stamp - max(self.delay, 0.0)) @ self.mount @ noise
@@ -68,6 +75,7 @@ class Drive(NamedTuple):
             if marked is not None:
                 level = inverse(estimator.calibration.T_body_cloud)
                 spread = 2.0 * np.diag([POSITION, POSITION + 1.5 * HEADING, HEADING]) ** 2
+                spread[2, 2] += self.every * self.noise**2
                 estimator.measure_motion(
                     marked[2] @ level, T_cloud @ level, inverse(marked[0]) @ T, spread, (marked[1], mark[1])
                 )
@@ -86,6 +94,21 @@ def test_delay_is_measured_where_the_robot_turns_and_accelerates(delay):
     assert found.sigma_delay < 0.01
     assert abs(np.degrees(found.heading)) < 0.1
     assert np.hypot(found.lever_x, found.lever_y) < 0.02
+
+
+@pytest.mark.parametrize("seed", [100, 102, 103])
+def test_noise_of_odometry_is_no_delay_to_the_filter(seed, monkeypatch):
+    """A backward difference of the newest step has the noise of that step, which looks like half a step's delay."""
+    monkeypatch.setattr(DelaySearch, "better_than", lambda *_: None)
+    found = Drive(STRAIGHT, noise=np.radians(0.2), every=3, seed=seed).learnt().calibration
+    assert abs(found.delay) < 0.001
+    assert found.sigma_delay < 0.005
+
+
+def test_interpolation_of_odometry_averages_its_noise():
+    history = OdometryHistory.of(np.arange(0.0, 3.0, 0.2), np.tile(np.eye(4), (15, 1, 1)))
+    begins = np.array([0.4, 0.5, 0.45])
+    np.testing.assert_allclose(history.noise_share(begins, begins + 0.6), [1.0, 5 / 6, 1 - 3 / 24])
 
 
 def test_heading_and_lever_arm_are_measured():
