@@ -17,6 +17,7 @@ RESOLUTION = 0.05  # seconds within which the filter converges to a delay
 DELAYS: Floats = RESOLUTION * np.arange(-20.0, 21.0)
 """Delays that are compared, seconds."""
 _FADES = 100.0  # metres over which evidence for a delay is forgotten, as clocks drift
+_FORGOTTEN = 0.05  # weight below which a motion no longer counts
 _FREEDOM = 4.0  # degrees of freedom of Student's distribution
 _STEPS = math.log(1e-6)  # log-probability that a clock has just taken a step: once in twelve days
 _TILT = 2.0  # ratio of a registration's errors of roll and pitch to that of its heading
@@ -48,6 +49,10 @@ class DelaySearch:
     finds large delays and also uses the shaking of the body. A motion is judged once odometry extends beyond it by the
     largest delay.
 
+    Where odometry's noise is larger than the robot's changes of speed, each motion favours some delay by chance. So a
+    delay also has to be favoured steadily: a sum of symmetric terms exceeds x times the root of their sum of
+    squares with probability exp(-x^2 / 2) at most.
+
     Attributes:
         evidence: (D,) log-likelihoods of DELAYS, up to a constant.
         shaking: (D,) the part of it from the body's roll and pitch.
@@ -55,6 +60,7 @@ class DelaySearch:
 
     def __init__(self) -> None:
         self.evidence, self.shaking = np.zeros((2, len(DELAYS)))
+        self._judged: list[tuple[float, Floats]] = []  # weights and log-likelihoods (D,) of the motions
         self._waiting: deque[SeenMotion] = deque(maxlen=30)
 
     def add(self, seen: SeenMotion) -> None:
@@ -92,12 +98,14 @@ class DelaySearch:
         spread, share = seen.spread, odometry.noise_share(seen.begin - DELAYS, seen.end - DELAYS)
         flat = np.column_stack([seen.motion[:2, 3] - moved[:, :2], heading])
         squares = np.einsum("di,ij,dj->d", flat, np.linalg.inv(spread), flat) / share
-        shaken = (tilts**2).sum(axis=1) / (_TILT**2 * spread[2, 2]) / share
+        shaken = (tilts**2).sum(axis=1) / (_TILT**2 * spread[2, 2])
         evidence = -0.5 * (_FREEDOM + 3.0) * np.log1p(squares / _FREEDOM)
         tilted = -0.5 * (_FREEDOM + 2.0) * np.log1p(shaken / _FREEDOM)
         evidence += tilted
         fade = math.exp(-float(np.linalg.norm(seen.motion[:3, 3])) / _FADES)
         self.evidence = fade * self.evidence + evidence - evidence.max()
+        self._judged = [(fade * weight, row) for weight, row in self._judged if weight > _FORGOTTEN]
+        self._judged.append((1.0, evidence))
         shaking = fade * self.shaking + tilted
         self.shaking = np.maximum(shaking - shaking.max(), _STEPS)
 
@@ -106,6 +114,12 @@ class DelaySearch:
 
         None if it does not, or if it lacks the log-odds of a ``surprise`` that may be anywhere on the grid.
         """
-        near = np.abs(DELAYS - delay) <= 3.0 * sigma + RESOLUTION
-        best, there = int(self.evidence.argmax()), self.evidence[near].max(initial=-math.inf)
-        return float(DELAYS[best]) if self.evidence[best] - there > surprise + math.log(len(DELAYS)) else None
+        gap, best = np.abs(DELAYS - delay), int(self.evidence.argmax())
+        near = gap <= max(3.0 * sigma + RESOLUTION, float(gap.min()))
+        if near[best]:
+            return None
+        there = int(np.where(near, self.evidence, -math.inf).argmax())
+        each = np.array([weight * (row[best] - row[there]) for weight, row in self._judged])
+        steady = 0.5 * float(each.sum()) ** 2 / max(float(np.square(each).sum()), 1e-12)
+        gain = min(float(self.evidence[best] - self.evidence[there]), steady)
+        return float(DELAYS[best]) if gain > surprise + math.log(len(DELAYS)) else None

@@ -222,8 +222,8 @@ class CalibrationBelief:
     def update(self, measured: Floats, H: Floats, R: Floats, right: float = 1.0, part: Floats | None = None) -> float:
         """Add a measurement ``measured`` = H x + noise of covariance R; return its prior log-likelihood.
 
-        ``right`` is the probability that the measurement is valid; it reduces the gain accordingly. Of the others than
-        ``part`` (10,) of 0 and 1, default all, only the errors count: they are not corrected (Schmidt's filter).
+        ``right`` is the probability that the measurement is valid; it reduces the gain accordingly. ``part`` (10,), 0
+        or 1, masks the components that are corrected, default all; the others add their errors (Schmidt's filter).
         """
         R = R / right + (1.0 / right - 1.0) * H @ self.P @ H.T
         gap = measured - H @ self.x
@@ -403,6 +403,7 @@ class CalibrationEstimator:
     def rescale(self, factor: float, sigma: float) -> None:
         """Apply a step of odometry's scale by a factor with relative ``sigma``: the random walk is too slow for it."""
         self._supposed = None
+        self._delays.forget_motions()
         self._known.rescale(factor, sigma)
         self._apply()
 
@@ -425,12 +426,14 @@ class CalibrationEstimator:
             step[:3, 3] *= 1.0 + seen.applied.scale
             J = motion_jacobian(step, rates, seen.applied.scale)
             part = None if _waits(seen.applied) else _DELAY
-            self._learn_motion(seen.motion, step, J, seen.noise, seen.applied, part)
+            scaled = replace(seen.applied, turn=0.0)  # the step is raw odometry but for its scale
+            self._learn_motion(seen.motion, step, J, seen.noise, scaled, part)
         if judged:
             now, surprise = self.calibration, math.log((1.0 - _CLOCK.share) / _CLOCK.share)
             delay = self._delays.better_than(now.delay, now.sigma_delay, surprise)
             if delay is not None:
                 self._known.begin_at(delay, RESOLUTION)
+                self._delays.forget_motions()  # they were measured at the old delay
                 self._apply()
 
     def measure_motion(
@@ -478,7 +481,7 @@ class CalibrationEstimator:
     def _learn_motion(
         self, motion: Pose, step: Pose, J: Floats, noise: Floats, applied: Calibration, part: Floats | None
     ) -> None:
-        """Add a motion to a ``part`` of the beliefs; ``applied`` is the calibration of it and ``step``."""
+        """Add a motion to the components ``part`` of the beliefs; ``applied`` is the calibration of it and ``step``."""
         turned = log_so3(motion[:3, :3] @ step[:3, :3].T)
         gap = np.append(motion[:2, 3] - step[:2, 3], turned[2])
         H = np.zeros((3, SIZE))

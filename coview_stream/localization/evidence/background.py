@@ -191,7 +191,7 @@ def estimate_background(now: Floats32, variance: Floats, ground: Floats32, most:
     Args:
         now: (N, 7 or 15) the newest keyframe's observations there.
         variance: (4,) mean of :func:`scatter` over the keyframes so far.
-        ground: (K, 7 or 15) observations at chance places that do not share the right place's ground.
+        ground: (K, 7 or 15) observations at chance places, where possible out of sight of the right one.
         most: limits on the number of independent observations.
     """
     most = most or Most()

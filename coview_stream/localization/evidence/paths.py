@@ -6,7 +6,7 @@ keyframes, so the poses of a place are smoothed to a path, and the path is shift
 evidence of all keyframes.
 
 The ratio of a place is the mean over equally probable shifts. A mean of ratios against chance is one, too: chance
-exceeds R with probability 1 / R at most.
+exceeds R with probability 1 / R at most. The factor of a turn is the mean over turns at the best shift.
 """
 
 from __future__ import annotations
@@ -18,47 +18,39 @@ from typing import NamedTuple
 import numpy as np
 
 import coview_kernels as kernels
-from coview_stream.geometry.arrays import Floats, Floats32
-from coview_stream.localization.evidence.background import Background, observe_around
+from coview_stream.geometry.arrays import Bools, Floats, Floats32
+from coview_stream.localization.evidence.background import NEARBY_VARIANCE, Background, observe_around
 from coview_stream.localization.evidence.likelihood import log_likelihood_ratios
 from coview_stream.localization.evidence.observation import ObservedScan, Share
 
-_STEP, _REACH = 1.0, 2  # metres of a shift, and steps to each side: the basin of a place
-_TURN = np.radians(1.0)
+_SHIFTS: Floats = np.array([(x, y, 0.0, 0.0) for y in range(-2, 3) for x in range(-2, 3)], dtype=np.float64)
+"""Shifts of a path, metres: the basin of a place."""
+_TURNS: Floats = np.radians(1.0) * np.array([[0.0, 0.0, 0.0, turn] for turn in (-1, 0, 1)])
 _DRIFT = 0.02, 0.05  # of odometry between keyframes, one sigma: share of the distance, and metres
-_SCATTER, _WEIGHT = (
-    0.2,
-    4.0,
-)  # metres of a pose about its path, of half-metre cells, and its weight in degrees of freedom
-
-
-def _grid(reach: int) -> Floats:
-    side = _STEP * np.arange(-reach, reach + 1)
-    x, y = np.meshgrid(side, side)
-    return np.column_stack([x.ravel(), y.ravel(), np.zeros((x.size, 2))])
-
-
-_BASIN, _AROUND = _grid(_REACH), _grid(1)
-_TURNS = np.array([[0.0, 0.0, 0.0, turn] for turn in (-_TURN, 0.0, _TURN)])
+_SCATTER = 0.2  # metres of a pose about its path where few poses show it: cells are half a metre wide
+_WEIGHT = 4.0  # of that scatter, in degrees of freedom
 
 
 class Settled(NamedTuple):
-    """Places at their best shifts."""
+    """P places at the best shifts of their paths."""
 
-    moves: Floats  # (P, 4) shifts in x, y, z and heading
-    ratios: Floats  # (P,) log-likelihood ratios against chance, as a mean over shifts
+    poses: Floats  # (P, 4) at the newest keyframe, best first shifted, then turned
     observed: Floats32  # (P, 15) mean observations there
+    shifted: Floats  # (P, S, 4) poses of all shifts at the newest keyframe
+    table: Floats  # (P, S) log-likelihood ratios of the shifts against chance, at the mean turn
+
+    def ratios(self, count: Bools | None = None) -> Floats:
+        """Return the log-likelihood ratios (P,) of the places, by the shifts that ``count`` (P, S), default all."""
+        table = self.table if count is None else np.where(count, self.table, -np.inf)
+        return np.asarray(np.logaddexp.reduce(table, axis=1) - np.log(table.shape[1]))
 
 
-def look_back(
-    field: kernels.FieldMap, scans: Sequence[ObservedScan], T_map_odom: Floats
-) -> tuple[Floats32, Floats]:  # fmt: skip
+def look_back(field: kernels.FieldMap, scans: Sequence[ObservedScan], T_map_odom: Floats) -> tuple[Floats32, Floats]:
     """Return observations (P, W, 15) of scans, oldest first, at places ``T_map_odom`` (P, 4, 4), and poses (P, W, 4).
 
     Each scan begins at the pose of the next newer one, which undoes odometry's drift, and moves to most hits nearby.
     """
-    width = len(Share) + 8
-    observed = np.empty((len(T_map_odom), len(scans), width), dtype=np.float32)
+    observed = np.empty((len(T_map_odom), len(scans), NEARBY_VARIANCE.stop), dtype=np.float32)
     poses = np.empty((len(T_map_odom), len(scans), 4))
     for k, scan in reversed(list(enumerate(scans))):
         there = scan.few.look_up(field, scan.poses(T_map_odom), kernels.Move.NEAR)
@@ -72,7 +64,7 @@ class Paths:
     """Poses of P places at W keyframes, oldest first."""
 
     field: kernels.FieldMap
-    scans: Sequence[ObservedScan]  # (W) of the keyframes
+    scans: Sequence[ObservedScan]  # (W,) of the keyframes
     poses: Floats  # (P, W, 4)
     around: Floats32  # (P, 8) outcomes around the places and their variances, means over the keyframes
 
@@ -98,32 +90,29 @@ class Paths:
 
     def settled(self, background: Background) -> Settled:
         """Return the places at the best shifts of their paths."""
-        every = np.arange(len(self.poses))
+        every, newest = np.arange(len(self.poses)), self.poses[:, -1]
 
-        def ratios(moves: Floats) -> tuple[Floats, Floats32]:
-            observed = self.observe(moves)
+        def ratios(observed: Floats32) -> Floats:
             flat = observed.reshape(-1, observed.shape[2])
-            return log_likelihood_ratios(flat, background).reshape(moves.shape[:2]), observed
+            return log_likelihood_ratios(flat, background).reshape(observed.shape[:2])
 
-        shifts = np.tile(_BASIN, (len(every), 1, 1))
-        table, _ = ratios(shifts)
-        top = table.max(axis=1)
-        mean = np.log(np.exp(table - top[:, None]).mean(axis=1)) + top
-        best = shifts[every, table.argmax(axis=1)]
-        further = best[:, None] + _AROUND
-        best = further[every, ratios(further)[0].argmax(axis=1)]
-        turned = best[:, None] + _TURNS
-        table, observed = ratios(turned)
-        turn = table.argmax(axis=1)
-        gain = table[every, turn] - table[:, 1] - np.log(len(_TURNS)) * (turn != 1)
-        return Settled(turned[every, turn], mean + np.maximum(gain, 0.0), observed[every, turn])
+        shifts = np.tile(_SHIFTS, (len(every), 1, 1))
+        table = ratios(self.observe(shifts))
+        turned = shifts[every, table.argmax(axis=1), None] + _TURNS
+        observed = self.observe(turned)
+        turns = ratios(observed)
+        gain = np.logaddexp.reduce(turns, axis=1) - np.log(len(_TURNS)) - table.max(axis=1)
+        best = turns.argmax(axis=1)
+        return Settled(
+            newest + turned[every, best], observed[every, best], newest[:, None] + shifts, table + gain[:, None]
+        )
 
 
 def smoothed(offsets: Floats, bodies: Floats) -> Floats:
     """Return offsets (P, W, 4) from straight paths, smoothed: odometry drifts as a random walk, and poses scatter.
 
-    ``bodies`` (W, 3) are the body's positions in the odometry frame. The scatter of a place is that about a linear
-    drift.
+    ``bodies`` (W, 3) are the body's positions in the odometry frame. The scatter of a place is that of x and y about a
+    linear drift; z and heading are averaged by the same weights.
     """
     count = len(bodies)
     steps = np.linalg.norm(np.diff(bodies, axis=0), axis=1)

@@ -115,7 +115,8 @@ def find_modes(
 ) -> Modes:  # fmt: skip
     """Register a scan from poses around ``leader``, the registered ``place``, and weight the results within it.
 
-    The evidence is that of all keyframes, by ``beside``. The place itself counts, too: registration may have left it.
+    The evidence is that of the reading's keyframes, by ``beside``; errors of two poses count as independent, which
+    favours doubt. The place itself counts, too: registration may have left it.
     """
     candidates = [leader]
     for angle in 2.0 * np.pi * np.arange(_DIRECTIONS) / _DIRECTIONS:

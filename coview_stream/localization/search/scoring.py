@@ -6,7 +6,7 @@ leader is compared with rivals at their best. The best places are followed: late
 and earlier keyframes are looked up at new places, so all places have the same observations. The evidence of a place is
 the log-likelihood ratio of its mean observation against the background of all others
 (:mod:`coview_stream.localization.evidence.likelihood`). The places that lead are moved to one pose for all keyframes
-(:mod:`coview_stream.localization.evidence.paths`); those that meet there are one.
+(:mod:`coview_stream.localization.evidence.paths`).
 """
 
 from __future__ import annotations
@@ -46,7 +46,9 @@ _PROMISING = 96  # best hypotheses that are looked up with many points
 _FOLLOWED = 64  # best places that the next keyframe observes again
 _KEPT = 16  # places kept by their evidence, whatever their rank at the newest keyframe
 _SETTLED = 8  # best places that are moved to one pose for all keyframes
-_BEHIND = 12.0  # log-odds against the first place from which on a place does not count
+_BEHIND = 12.0  # ratio less than the first place's from which on a place is not moved: odds of 6e-6
+_ASIDE = 3.0  # metres: beside the first place, its modes are compared; error from which on benchmarks call a fix false
+_FINER = 0.5, np.radians(0.5)  # metres, radians within which the newest keyframe's own pose is better
 _KEYFRAMES = 12  # keyframes with observations: the newest and the most spread earlier ones
 _NEWEST = 8  # newest keyframes, searched for a moved part
 _CHANCE = 112  # places that measure the correlation of chance over keyframes
@@ -270,8 +272,13 @@ class PlaceScorer:
             return []
         at = scan.transforms(part.poses[new])
         newest = np.column_stack([part.shares[new], observe_around(layers, scan.few, part.poses[new])])
-        observed = np.concatenate([look_back(layers, scans[:-1], at)[0], newest[:, None]], axis=1).mean(axis=1)
+        seen, poses = look_back(layers, scans[:-1], at)
+        each = np.concatenate([seen, newest[:, None]], axis=1)
+        observed = each.mean(axis=1)
         ratios = log_likelihood_ratios(observed, self._background)
+        if len(scans) > 1:  # as the leader's
+            poses = np.concatenate([poses, part.poses[new][:, None]], axis=1)
+            ratios = np.maximum(ratios, Paths.of(layers, scans, poses, each).settled(self._background).ratios())
         leader, variance = self._leader
         odds = odds_of(leader - ratios, variance + self._left * ratio_variances(observed, self._background))
         return [
@@ -373,28 +380,34 @@ class PlaceScorer:
     def _settled(
         self, followed: Followed, ratios: Floats, variances: Floats, scan: ObservedScan
     ) -> tuple[Followed, Floats, Floats]:
-        """Move the places that lead to one pose for all keyframes; return the distinct places and their evidence."""
+        """Move the places that lead to one pose for all keyframes; return the places, their ratios and variances.
+
+        A place whose keyframes lead to the first place has the evidence of the shifts that are not beside it.
+        """
         order = np.argsort(np.log1p(followed.votes) - ratios, kind="stable")
         top = order[:_SETTLED]
         top = top[ratios[top] > ratios[top[0]] - _BEHIND]
-        places, ratios, variances = list(followed.hypotheses), ratios.copy(), variances.copy()
-        T = np.array([place.T_map_odom for place in places])
-        paths = Paths.of(self._base_map.field, [*self._scans, scan], followed.poses[top], followed.observed[top])
-        found = paths.settled(self._background)
-        moved = found.moves[:, :2].any(axis=1)  # else the pose by the newest keyframe is finer
-        T[top[moved]] = scan.transforms((paths.poses[:, -1] + found.moves)[moved])
-        better = found.ratios > ratios[top]
-        ratios[top[better]] = found.ratios[better]
-        variances[top[better]] = (self._left * ratio_variances(found.observed, self._background))[better]
-        poses = scan.poses(T)
-        order = np.argsort(np.log1p(followed.votes) - ratios, kind="stable")
-        same = _same(poses[order], poses[order])
-        kept = np.flatnonzero(~np.tril(same, -1).any(axis=1))
-        votes = followed.votes.copy()
-        votes[order[kept]] = [followed.votes[order[row]].min() for row in same[kept]]
-        places = [replace(place, T_map_odom=at) for place, at in zip(places, T, strict=True)]
-        distinct = replace(followed, hypotheses=places, votes=votes)[order[kept]]
-        return distinct, ratios[order[kept]], variances[order[kept]]
+        part = followed[top]
+        found = Paths.of(self._base_map.field, [*self._scans, scan], part.poses, part.observed).settled(
+            self._background
+        )
+        mean, spread = found.ratios(), self._left * ratio_variances(found.observed, self._background)
+        better = mean > ratios[top]
+        own, several = part.poses[:, -1], np.where(better, mean, ratios[top])
+        away = _apart(found.poses - own, np.zeros(4), *_FINER)
+        at = np.where(away[:, None], found.poses, own)
+        first = int(np.argmin(np.log1p(part.votes) - several))
+        reach = BASIN_DISTANCE, BASIN_ANGLE
+        leads = ~_apart(found.poses, at[first], *reach) & _apart(own, at[first], *reach)
+        shifts = found.shifted.reshape(-1, 4)
+        rest = found.ratios(_apart(shifts, at[first], _ASIDE, BASIN_ANGLE).reshape(found.table.shape))
+        ratios, variances, places = ratios.copy(), variances.copy(), list(followed.hypotheses)
+        ratios[top] = np.where(leads, rest, several)
+        variances[top] = np.where(better | leads, spread, variances[top])
+        T = scan.transforms(np.where(leads[:, None], own, at))
+        for k, row in enumerate(top.tolist()):
+            places[row] = replace(places[row], T_map_odom=T[k])
+        return replace(followed, hypotheses=places), ratios, variances
 
     def _evidence(self, followed: Followed, observed: _Observed, scan: ObservedScan) -> tuple[Floats, Floats]:
         """Return log-likelihood ratios (P,) against the places that are not around the leader, and their variances."""

@@ -96,10 +96,12 @@ def test_delay_is_measured_where_the_robot_turns_and_accelerates(delay):
     assert np.hypot(found.lever_x, found.lever_y) < 0.02
 
 
-@pytest.mark.parametrize("seed", [100, 102, 103])
-def test_noise_of_odometry_is_no_delay_to_the_filter(seed, monkeypatch):
-    """A backward difference of the newest step has the noise of that step, which looks like half a step's delay."""
-    monkeypatch.setattr(DelaySearch, "better_than", lambda *_: None)
+@pytest.mark.parametrize("seed", [100, 102, 103, 104])
+def test_noise_of_odometry_is_no_delay(seed):
+    """A backward difference of the newest step has the noise of that step, which looks like half a step's delay.
+
+    At constant speed every motion favours another delay by chance, too.
+    """
     found = Drive(STRAIGHT, noise=np.radians(0.2), every=3, seed=seed).learnt().calibration
     assert abs(found.delay) < 0.001
     assert found.sigma_delay < 0.005

@@ -152,6 +152,18 @@ def test_place_that_is_new_is_observed_from_earlier_keyframes_as_well(world_map,
     assert result[0].ratio == pytest.approx(result[1].ratio, rel=0.25)
 
 
+def test_place_whose_keyframes_lead_to_the_leader_is_hardly_a_rival(scorer, world_drive):
+    """It keeps its pose, its hint and its votes, but the evidence at the leader is not its own."""
+    for k in range(4):
+        scan = scan_of(world_drive, k)
+        aside = hypothesis(off(2.6, 0.0, 0.0, scan), station=None)
+        result = scored(scorer, [*some_places(scan, 12), aside], scan, hints=1)
+    assert is_right(result.places[0], scan)
+    gaps = [np.linalg.norm(((place.T_map_odom - ODOM) @ scan.T_odom_body)[:2, 3]) for place in result.places]
+    assert sum(gap < 1.0 for gap in gaps) == 1
+    assert result.error < 1e-3
+
+
 def test_hypotheses_beside_the_leader_are_tried(world_map, world_drive):
     """Along a corridor the robot may be anywhere: what lies beside the best place is its rival."""
     scorer = PlaceScorer(world_map)
