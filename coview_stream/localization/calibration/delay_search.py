@@ -68,7 +68,7 @@ class DelaySearch:
         self._waiting.append(seen)
 
     def forget_motions(self) -> None:
-        """Forget the waiting motions, which belong to another mount."""
+        """Forget the waiting motions, which belong to another mount, scale or delay."""
         self._waiting.clear()
 
     def judge(self, odometry: OdometryHistory) -> list[tuple[SeenMotion, Pose, Floats]]:

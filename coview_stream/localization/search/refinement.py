@@ -30,7 +30,6 @@ from coview_stream.geometry.transforms import (
     transform,
     yaw_of,
 )
-from coview_stream.localization.evidence.likelihood import odds_of
 from coview_stream.localization.evidence.observation import ObservedScan
 from coview_stream.localization.registration.clouds import LocalMaps, prepare_scan
 from coview_stream.localization.registration.register import gravity_information, register
@@ -45,7 +44,7 @@ _DIRECTIONS = 8
 _SAME_METRES, _SAME_RADIANS = 0.3, np.radians(2.0)  # closer poses are one mode
 
 
-Beside = Callable[[Floats], tuple[Floats, Floats]]
+Beside = Callable[[Floats], Floats]
 """Returns the evidence of poses beside a place: :meth:`PlaceScorer.beside`."""
 
 
@@ -115,8 +114,7 @@ def find_modes(
 ) -> Modes:  # fmt: skip
     """Register a scan from poses around ``leader``, the registered ``place``, and weight the results within it.
 
-    The evidence is that of the reading's keyframes, by ``beside``; errors of two poses count as independent, which
-    favours doubt. The place itself counts, too: registration may have left it.
+    The evidence is that of the reading's keyframes, by ``beside``.
     """
     candidates = [leader]
     for angle in 2.0 * np.pi * np.arange(_DIRECTIONS) / _DIRECTIONS:
@@ -125,11 +123,8 @@ def find_modes(
         other = register_place(place, scan, base_map, config, local_maps, start)
         if other is not None and same_place(other.T_map_odom, place.T_map_odom, request, BASIN_DISTANCE, BASIN_ANGLE):
             candidates.append(other)
-    poses = np.array([*(candidate.T_map_odom for candidate in candidates), place.T_map_odom])
-    ratios, variances = beside(poses)
-    top = int(ratios[:-1].argmax())
-    odds = odds_of(ratios[top] - ratios, variances[top] + variances)
-    odds[top] = 1.0
+    poses = np.array([candidate.T_map_odom for candidate in candidates])
+    ratios = beside(poses)
 
     def gap(k: int, other: int) -> tuple[float, float]:
         """Return metres and radians between two poses of the robot."""
@@ -137,9 +132,10 @@ def find_modes(
         return float(np.linalg.norm(step[3:])), float(np.linalg.norm(step[:3]))
 
     modes: list[int] = []
-    for k in [*np.argsort(-ratios[:-1], kind="stable").tolist(), len(candidates)]:
+    for k in np.argsort(-ratios, kind="stable").tolist():
         gaps = (gap(k, mode) for mode in modes)
         if not any(metres < _SAME_METRES and radians < _SAME_RADIANS for metres, radians in gaps):
             modes.append(k)
+    weights = np.exp(ratios[modes] - ratios[modes[0]])
     metres = [gap(k, modes[0])[0] for k in modes]
-    return Modes(candidates[modes[0]], np.array(metres), odds[modes] / odds[modes].sum())
+    return Modes(candidates[modes[0]], np.array(metres), weights / weights.sum())

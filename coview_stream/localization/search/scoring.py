@@ -48,6 +48,7 @@ _KEPT = 16  # places kept by their evidence, whatever their rank at the newest k
 _SETTLED = 8  # best places that are moved to one pose for all keyframes
 _BEHIND = 12.0  # ratio less than the first place's from which on a place is not moved: odds of 6e-6
 _ASIDE = 3.0  # metres: beside the first place, its modes are compared; error from which on benchmarks call a fix false
+_NOWHERE = -60.0  # ratio of a place without a shift that counts: finite, as messages have to be
 _FINER = 0.5, np.radians(0.5)  # metres, radians within which the newest keyframe's own pose is better
 _KEYFRAMES = 12  # keyframes with observations: the newest and the most spread earlier ones
 _NEWEST = 8  # newest keyframes, searched for a moved part
@@ -286,10 +287,11 @@ class PlaceScorer:
             for T, score, ratio, each in zip(at, part.scores[new], ratios, odds, strict=True)
         ]
 
-    def beside(self, T_map_odom: Floats) -> tuple[Floats, Floats]:
-        """Return log-likelihood ratios (M,) of poses (M, 4, 4) beside the most probable place, and their variances.
+    def beside(self, T_map_odom: Floats) -> Floats:
+        """Return log-likelihood ratios (M,) of poses (M, 4, 4) beside the most probable place.
 
-        At all keyframes they lie equally far from the place's path.
+        At all keyframes they lie equally far from the place's path. Chance is the same at all of them, and so is its
+        error.
         """
         layers, first = self._base_map.field, self._followed[np.arange(1)]
         newest = self._scans[-1].poses(first.hypotheses[0].T_map_odom[None])
@@ -297,9 +299,7 @@ class PlaceScorer:
         paths = Paths.of(layers, self._scans, np.concatenate([poses, newest[:, None]], axis=1), first.observed)
         moves = self._scans[-1].poses(T_map_odom) - paths.poses[:, -1]
         moves[:, 2], moves[:, 3] = 0.0, (moves[:, 3] + np.pi) % (2.0 * np.pi) - np.pi
-        observed = paths.observe(moves[None], many=True)[0]
-        variances = ratio_variances(observed, self._background)
-        return log_likelihood_ratios(observed, self._background), self._left * variances
+        return log_likelihood_ratios(paths.observe(moves[None], many=True)[0], self._background)
 
     def _thin_out(self) -> None:
         """Drop the keyframe closest to its neighbours if there are too many; the first and the newest stay."""
@@ -402,7 +402,7 @@ class PlaceScorer:
         shifts = found.shifted.reshape(-1, 4)
         rest = found.ratios(_apart(shifts, at[first], _ASIDE, BASIN_ANGLE).reshape(found.table.shape))
         ratios, variances, places = ratios.copy(), variances.copy(), list(followed.hypotheses)
-        ratios[top] = np.where(leads, rest, several)
+        ratios[top] = np.where(leads, np.maximum(rest, _NOWHERE), several)
         variances[top] = np.where(better | leads, spread, variances[top])
         T = scan.transforms(np.where(leads[:, None], own, at))
         for k, row in enumerate(top.tolist()):
