@@ -40,11 +40,12 @@ from coview_stream.localization.evidence.observation import ObservedScan
 from coview_stream.localization.registration.clouds import LocalMaps, prepare_scan, voxelized
 from coview_stream.localization.search.consensus import Consensus, Hypothesis, yaw_of_shift
 from coview_stream.localization.search.global_search import GlobalSearch
+from coview_stream.localization.search.places import Scored
 from coview_stream.localization.search.recognizers import SearchIndex
 from coview_stream.localization.search.refinement import register_place
 from coview_stream.localization.search.request import SearchRequest
 from coview_stream.localization.search.retrieval import exact_distances
-from coview_stream.localization.search.scoring import PlaceScorer, Scored
+from coview_stream.localization.search.scoring import PlaceScorer
 from coview_stream.report.evaluation import driven
 
 BEST, APART = 5, 10.0  # places that each method names, and metres between two of them

@@ -14,8 +14,8 @@ from coview_stream.localization.calibration.calibration import Calibration
 from coview_stream.localization.result import KeyframeEvidence
 from coview_stream.localization.search.consensus import Hypothesis
 from coview_stream.localization.search.hints import FROM_THERE
+from coview_stream.localization.search.places import Rivals, Scored
 from coview_stream.localization.search.request import FIRST_EPOCH, Epoch, SearchRequest
-from coview_stream.localization.search.scoring import Rivals, Scored
 from coview_stream.localization.state import State
 
 BY_FEATURES = " (by learned features)"

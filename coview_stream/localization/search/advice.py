@@ -19,8 +19,8 @@ from coview_stream.geometry.transforms import Pose, inverse, pose_from, rot_z
 from coview_stream.localization.search.acceptance import Considered, SearchResult
 from coview_stream.localization.search.ambiguity import virtual_scan
 from coview_stream.localization.search.global_search import GlobalSearch
+from coview_stream.localization.search.places import BASIN_ANGLE, BASIN_DISTANCE
 from coview_stream.localization.search.request import Epoch, SearchRequest
-from coview_stream.localization.search.scoring import BASIN_ANGLE, BASIN_DISTANCE
 from coview_stream.localization.state import State
 
 _SIDES = ("ahead", "to the left", "back", "to the right")  # of the body, counter-clockwise

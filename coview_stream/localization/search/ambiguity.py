@@ -24,8 +24,9 @@ from coview_stream.geometry.transforms import Points, norms, pose_from, yaw_of
 from coview_stream.localization.evidence.observation import ObservedScan
 from coview_stream.localization.registration.clouds import prepare_scan
 from coview_stream.localization.search.consensus import Hypothesis
+from coview_stream.localization.search.places import Scored
 from coview_stream.localization.search.retrieval import Retrieval, StationConsensus
-from coview_stream.localization.search.scoring import AROUND, PlaceScorer, Scored
+from coview_stream.localization.search.scoring import AROUND, PlaceScorer
 
 STATIONS = 1000  # at most; a twentieth of a second each
 _DRIVES = 100  # simulated drives from stations that are not localized at once; the rest copy their nearest neighbour

@@ -19,10 +19,11 @@ from coview_stream.localization.registration.clouds import LocalMaps, prepare_sc
 from coview_stream.localization.search.acceptance import Considered, SearchResult, decide
 from coview_stream.localization.search.consensus import Hypothesis
 from coview_stream.localization.search.hints import HintSchedule, on_the_ground, robot_position
+from coview_stream.localization.search.places import BASIN_ANGLE, BASIN_DISTANCE, Scored
 from coview_stream.localization.search.recognizers import CoViewRecognizer, PlaceRecognizer, SearchIndex
 from coview_stream.localization.search.refinement import find_modes, levelled_by_frame, register_place
 from coview_stream.localization.search.request import EarlierKeyframe, Epoch, RequestSpec, SearchRequest, same_place
-from coview_stream.localization.search.scoring import BASIN_ANGLE, BASIN_DISTANCE, PlaceScorer, Scored
+from coview_stream.localization.search.scoring import PlaceScorer
 
 _ORDINARY = 20_000  # stations up to which the configured number of co-view hypotheses is enough
 _GUESSES = 12  # poses of a guess tried per keyframe

@@ -34,8 +34,8 @@ from coview_stream.localization.evidence.observation import ObservedScan
 from coview_stream.localization.registration.clouds import LocalMaps, prepare_scan
 from coview_stream.localization.registration.register import gravity_information, register
 from coview_stream.localization.search.consensus import Hypothesis
+from coview_stream.localization.search.places import BASIN_ANGLE, BASIN_DISTANCE
 from coview_stream.localization.search.request import SearchRequest, same_place
-from coview_stream.localization.search.scoring import BASIN_ANGLE, BASIN_DISTANCE
 
 _WIDEST = 1.0  # metres; scoring moves to the best pose nearby, so coarser scales are not needed
 _EVERY = 3  # every third point is registered: changes the score by 0.002 and the pose by a centimetre

@@ -12,13 +12,13 @@ the log-likelihood ratio of its mean observation against the background of all o
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from coview_kernels import Move
 from coview_stream.basemap.basemap import BaseMap
-from coview_stream.geometry.arrays import Bools, Floats, Floats32, Ints
+from coview_stream.geometry.arrays import Floats, Floats32, Ints
 from coview_stream.geometry.transforms import Circle
 from coview_stream.localization.evidence.background import (
     NEARBY_VARIANCE,
@@ -35,11 +35,11 @@ from coview_stream.localization.evidence.likelihood import (
     posterior,
     ratio_variances,
 )
-from coview_stream.localization.evidence.moved_part import NO_PART, MovedPart
 from coview_stream.localization.evidence.observation import ObservedScan, Share, surroundings
 from coview_stream.localization.evidence.open_places import SIGHT, OpenPlaces
 from coview_stream.localization.evidence.paths import Paths, look_back
 from coview_stream.localization.search.consensus import Hypothesis
+from coview_stream.localization.search.places import BASIN_ANGLE, BASIN_DISTANCE, Rivals, Scored, apart, grouped, same
 from coview_stream.localization.search.request import SAME_ANGLE, SAME_DISTANCE
 
 _PROMISING = 96  # best hypotheses that are looked up with many points
@@ -55,80 +55,8 @@ _NEWEST = 8  # newest keyframes, searched for a moved part
 _CHANCE = 112  # places that measure the correlation of chance over keyframes
 _RENEWED = 28  # of them, the oldest, replaced at each keyframe: only new ones are looked up at the earlier ones
 _CHANCE_REACH = 6.0, np.radians(20.0)  # metres, radians from the leader; closer places share its explanation
-BASIN_DISTANCE, BASIN_ANGLE = SAME_DISTANCE, float(np.radians(15.0))
-"""Metres and radians from the leader within which registration converges to it."""
-
 AROUND = np.array([(r * np.cos(a), r * np.sin(a)) for r in (3.5, 7.0) for a in np.arange(8) * np.pi / 4])
 """Shifts of the leader, metres, as further hypotheses: along a corridor it may be anywhere."""
-
-
-@dataclass(frozen=True)
-class Rivals:
-    """All distinct places of one keyframe, best score first."""
-
-    T_map_odom: Floats = field(default_factory=lambda: np.empty((0, 4, 4)))  # (N, 4, 4)
-    # (N,) float32 evidence scores in [0, 1]; the best from four times as many points
-    scores: Floats32 = field(default_factory=lambda: np.empty(0, dtype=np.float32))
-    # (N,) float32 shares of the scan in the surveyed area
-    inside: Floats32 = field(default_factory=lambda: np.empty(0, dtype=np.float32))
-
-    def __len__(self) -> int:
-        """Return the number of places N."""
-        return len(self.scores)
-
-
-@dataclass(frozen=True)
-class Scored:
-    """Scores of a keyframe's hypotheses."""
-
-    rivals: Rivals  # all places
-    places: list[Hypothesis]  # followed places, most probable first; then those that only the map names
-    error: float = 1.0  # probability that the robot is not at the first place
-    none: float = 1.0  # probability that it is at no place of the map
-    by_chance: float = np.inf  # expected number of chance places as good as the first
-    second: Hypothesis | None = None  # most probable place other than the first; None without any
-    moved: MovedPart = NO_PART  # part of the scans that fits elsewhere than at the first
-
-    @property
-    def left(self) -> int:
-        """Effective number of places: the number of equally probable places with the same entropy."""
-        probability = np.array([place.probability for place in self.places])
-        share = probability[probability > 0.0] / max(float(probability.sum()), 1e-300)
-        return round(float(np.exp(-(share * np.log(share)).sum())))
-
-    def together_with(self, other: Scored) -> Scored:
-        """Return these places with the error by both readings of the scan, which share their first place.
-
-        The odds against "none", which is common to both, add up; the other's places count only in the error.
-        """
-        none = [max(each.none, 1e-300) for each in (self, other)]
-        right = sum((1.0 - each.error) / part for each, part in zip((self, other), none, strict=True))
-        wrong = sum(each.error / part for each, part in zip((self, other), none, strict=True)) - 1.0
-        share = 1.0 / (right + wrong)
-        places = [replace(place, probability=place.probability / none[0] * share) for place in self.places]
-        second = next((k for k, place in enumerate(self.places) if place is self.second), None)
-        return replace(
-            self, places=places, error=wrong * share, none=share, second=None if second is None else places[second]
-        )
-
-    def beside(self, others: list[Hypothesis]) -> Scored:
-        """Add places whose ``probability`` is their odds against the first place."""
-        if not others:
-            return self
-        right = 1.0 - self.error  # of all poses around the first place, and of both readings
-        share = 1.0 / (1.0 + right * sum(place.probability for place in others))
-        places = [replace(place, probability=share * place.probability) for place in self.places]
-        added = [replace(place, probability=right * share * place.probability) for place in others]
-        second = next((k for k, place in enumerate(self.places) if place is self.second), None)
-        rivals = added if second is None else [*added, places[second]]
-        return replace(
-            self, places=[*places, *added], error=1.0 - share * right, none=share * self.none,
-            second=max(rivals, key=lambda place: place.probability),
-        )  # fmt: skip
-
-    def doubted(self, moved: MovedPart) -> Scored:
-        """Add the error by a moved part, as either part may be the unmoved one."""
-        return replace(self, error=min(1.0, self.error + 0.5 * moved.probability), moved=moved)
 
 
 @dataclass(frozen=True)
@@ -251,7 +179,7 @@ class PlaceScorer:
         if not places:
             return Scored(rivals, places)
         poses = scan.poses(np.array([place.T_map_odom for place in places]))
-        elsewhere = _apart(poses, poses[0], BASIN_DISTANCE, BASIN_ANGLE)
+        elsewhere = apart(poses, poses[0], BASIN_DISTANCE, BASIN_ANGLE)
         second = next((place for place, other in zip(places, elsewhere, strict=True) if other), None)
         by_chance = expected_by_chance(places[0].ratio, len(first))
         return Scored(rivals, places, chances.error(~elsewhere), chances.none, by_chance, second)
@@ -265,9 +193,9 @@ class PlaceScorer:
         known = scan.poses(np.array([place.T_map_odom for place in self._followed.hypotheses]))
         part = scan.many.look_up(layers, scan.few.look_up(layers, scan.poses(T_map_odom), Move.FAR).poses, Move.NEAR)
         new = [
-            group[0] for group in _places(part.poses, part.scores)
-            if _apart(known, part.poses[group[0]], SAME_DISTANCE, SAME_ANGLE).all()
-            and _apart(part.poses[group[:1]], known[0], BASIN_DISTANCE, BASIN_ANGLE).all()
+            group[0] for group in grouped(part.poses, part.scores)
+            if apart(known, part.poses[group[0]], SAME_DISTANCE, SAME_ANGLE).all()
+            and apart(part.poses[group[:1]], known[0], BASIN_DISTANCE, BASIN_ANGLE).all()
         ]  # fmt: skip
         if not new:
             return []
@@ -339,7 +267,7 @@ class PlaceScorer:
         promising = np.argsort(-scores * coarse.inside, kind="stable")[:_PROMISING]
         closer = scan.many.look_up(layers, poses[promising], Move.NEAR)
         poses[promising], shares[promising], scores[promising] = closer.poses, closer.shares, closer.scores
-        found = replace(coarse, groups=_places(poses, scores * coarse.inside))
+        found = replace(coarse, groups=grouped(poses, scores * coarse.inside))
         around = np.zeros((len(poses), 8), dtype=np.float32)
         around[found.first] = observe_around(layers, scan.few, poses[found.first])
         return replace(found, shares=np.column_stack([shares, around]))
@@ -394,13 +322,13 @@ class PlaceScorer:
         mean, spread = found.ratios(), self._left * ratio_variances(found.observed, self._background)
         better = mean > ratios[top]
         own, several = part.poses[:, -1], np.where(better, mean, ratios[top])
-        away = _apart(found.poses - own, np.zeros(4), *_FINER)
+        away = apart(found.poses - own, np.zeros(4), *_FINER)
         at = np.where(away[:, None], found.poses, own)
         first = int(np.argmin(np.log1p(part.votes) - several))
         reach = BASIN_DISTANCE, BASIN_ANGLE
-        leads = ~_apart(found.poses, at[first], *reach) & _apart(own, at[first], *reach)
+        leads = ~apart(found.poses, at[first], *reach) & apart(own, at[first], *reach)
         shifts = found.shifted.reshape(-1, 4)
-        rest = found.ratios(_apart(shifts, at[first], _ASIDE, BASIN_ANGLE).reshape(found.table.shape))
+        rest = found.ratios(apart(shifts, at[first], _ASIDE, BASIN_ANGLE).reshape(found.table.shape))
         ratios, variances, places = ratios.copy(), variances.copy(), list(followed.hypotheses)
         ratios[top] = np.where(leads, np.maximum(rest, _NOWHERE), several)
         variances[top] = np.where(better | leads, spread, variances[top])
@@ -445,10 +373,10 @@ class PlaceScorer:
             if last:
                 break
             leader = poses[np.argmin(np.log1p(followed.votes) - ratios)]
-            elsewhere = _apart(sample, leader, SIGHT, np.pi)
+            elsewhere = apart(sample, leader, SIGHT, np.pi)
             # places around the leader share its explanation
-            chance, distant, wrong = (_apart(at, leader, *_CHANCE_REACH) for at in (places, poses, sample))
-            near = ~_apart(np.concatenate([places, poses]), leader, SIGHT, np.pi)
+            chance, distant, wrong = (apart(at, leader, *_CHANCE_REACH) for at in (places, poses, sample))
+            near = ~apart(np.concatenate([places, poses]), leader, SIGHT, np.pi)
             self._scatter[-1] = scatter(observed.shares[first][chance])
         self._background, self._left = background, float(left[:3].mean())
         return ratios, self._left * ratio_variances(mean, background)  # shrinks like the scatter
@@ -464,40 +392,9 @@ class PlaceScorer:
         again = scan.few.look_up(layers, poses, Move.NEAR)
         now = np.column_stack([again.shares, observe_around(layers, scan.few, again.poses)])
         history = np.concatenate([history, now[:, None]], axis=1)
-        others = np.flatnonzero(~_same(places, again.poses).any(axis=1))
+        others = np.flatnonzero(~same(places, again.poses).any(axis=1))
         rows = others[np.linspace(0, len(others) - 1, min(len(others), _CHANCE - len(poses))).astype(np.int64)]
         rows = rows[np.argsort(np.arange(len(rows)) % (_CHANCE // _RENEWED), kind="stable")]  # renewed at all scores
         earlier = look_back(layers, self._scans, scan.transforms(places[rows]))[0]
         new = np.concatenate([earlier, shares[rows][:, None]], axis=1)
         return np.concatenate([again.poses, places[rows]]), np.concatenate([history, new])
-
-
-def _apart(poses: Floats, leader: Floats, distance: float, angle: float) -> Bools:
-    """Return a mask of the poses (P, 4) more than ``distance`` metres or ``angle`` radians from a leader (4,)."""
-    turn = np.abs((poses[:, 3] - leader[3] + np.pi) % (2.0 * np.pi) - np.pi)
-    return np.asarray((np.linalg.norm(poses[:, :3] - leader[:3], axis=1) > distance) | (turn > angle))
-
-
-def _same(poses: Floats, others: Floats) -> Bools:
-    """Return a mask (P, Q) of the poses (P, 4) and the others (Q, 4) that are one place."""
-    (x, y, z, yaw), (u, v, w, turn) = poses.astype(np.float32).T, others.astype(np.float32).T
-    gap = np.square(x[:, None] - u) + np.square(y[:, None] - v) + np.square(z[:, None] - w)
-    along = np.outer(np.cos(yaw), np.cos(turn)) + np.outer(np.sin(yaw), np.sin(turn))
-    return np.asarray((gap < SAME_DISTANCE**2) & (along > np.cos(SAME_ANGLE)))
-
-
-def _places(pose: Floats, rank: Floats32) -> list[list[int]]:
-    """Group poses (H, 4) into places: lists of rows, best pose and best place first."""
-    order = np.argsort(-rank, kind="stable")
-    same = _same(pose[order], pose[order])
-    free = np.ones(len(order), dtype=bool)
-    alone, rows = (np.count_nonzero(same, axis=1) == 1).tolist(), order.tolist()
-    out = []
-    for k, row in enumerate(same):
-        if alone[k]:
-            out.append([rows[k]])
-        elif free[k]:
-            members = np.flatnonzero(row & free)
-            free[members] = False
-            out.append(order[members].tolist())
-    return out

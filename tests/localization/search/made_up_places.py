@@ -13,8 +13,8 @@ from coview_stream.geometry.transforms import inverse, pose_from, rot_z
 from coview_stream.localization.evidence.observation import Evidence
 from coview_stream.localization.search.acceptance import SearchResult, decide
 from coview_stream.localization.search.consensus import Hypothesis
+from coview_stream.localization.search.places import Rivals, Scored
 from coview_stream.localization.search.request import SearchRequest
-from coview_stream.localization.search.scoring import Rivals, Scored
 
 
 class Votes:

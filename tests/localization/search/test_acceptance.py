@@ -13,7 +13,7 @@ from coview_stream.geometry.transforms import Circle, pose_from, rot_z
 from coview_stream.localization.search.acceptance import BY_FEATURES, IN_CIRCLE, MAX_PLACES, Considered, decide
 from coview_stream.localization.search.consensus import Hypothesis
 from coview_stream.localization.search.hints import FROM_THERE
-from coview_stream.localization.search.scoring import Rivals, Scored
+from coview_stream.localization.search.places import Rivals, Scored
 from coview_stream.localization.state import State
 
 

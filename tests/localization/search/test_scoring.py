@@ -14,7 +14,8 @@ from coview_stream.localization.evidence.observation import ObservedScan
 from coview_stream.localization.evidence.paths import look_back
 from coview_stream.localization.registration.clouds import prepare_scan
 from coview_stream.localization.search.consensus import Hypothesis
-from coview_stream.localization.search.scoring import PlaceScorer, Rivals, Scored
+from coview_stream.localization.search.places import Rivals, Scored
+from coview_stream.localization.search.scoring import PlaceScorer
 
 ODOM = pose_from(rot_z(-0.7), [12.0, 40.0, 3.0])  # map <- odometry
 
