@@ -25,6 +25,7 @@ from coview_stream.localization.registration.register import (
 from coview_stream.localization.tracking.monitor import EvidenceBaseline, MatchVerdict, RejectionReason
 from coview_stream.localization.tracking.place_evidence import Observation, PlaceEvidence
 from coview_stream.localization.tracking.pose_graph import Estimate
+from coview_stream.localization.tracking.shared_error import SharedErrorModel
 from coview_stream.localization.tracking.slip import Dispute, matters, off_by
 
 _RINGS = ((0.9, 6), (1.7, 10), (2.5, 14), (3.3, 18))  # metres, poses; each moves to the best within 0.4 m
@@ -119,6 +120,7 @@ class MapMatcher:
         place: evidence of the tracked place, against chance.
         dispute: evidence of the possible places while the scans contradict odometry.
         baseline: usual evidence, for reasons in words.
+        shared: error of registrations here that their own covariance leaves out.
     """
 
     def __init__(self, base_map: BaseMap, config: LocalizerConfig) -> None:
@@ -127,11 +129,13 @@ class MapMatcher:
         self.place = PlaceEvidence(base_map)
         self.dispute = Dispute(self.place, config.tracking.distance)
         self.baseline = EvidenceBaseline()
+        self.shared = SharedErrorModel(config.registration)
 
     def clear(self) -> None:
         """Forget the usual shares of the previous place."""
         self.place.clear()
         self.baseline.usual = None
+        self.shared.clear()
 
     def match(
         self,
@@ -171,7 +175,9 @@ class MapMatcher:
             of_body = registration._replace(T_map_source=T_map_odom @ scan.T_odom_body)
             T_map_body, measured = remove_prior(of_body, Prior(belief.T_map_body, information), settings)
             covariance = scan.cloud.doubted(registration_covariance(measured, settings))
-            innovation = predicted.innovation(T_map_body, covariance)
+            if self.shared.unknown:  # until a verified registration tells it
+                self.shared.learn(scan.cloud, T_map_odom, target, scan.body, -np.inf)
+            innovation = predicted.innovation(T_map_body, covariance + self.shared.own + self.shared.covariance)
         except InputError as error:
             return _failed(belief, str(error), evidence, observation)
         verdict = MatchVerdict(cause, reason, evidence, innovation, observation)
@@ -196,35 +202,27 @@ class MapMatcher:
         return [self._against(attempt, tries) for attempt in tries]
 
     def against_odometry(
-        self,
-        match: MapMatch,
-        scan: ObservedScan,
-        tries: list[MapMatch],
-        T_map_predicted: Pose,
-        belief: Estimate,
-        travelled: float,
+        self, match: MapMatch, scan: ObservedScan, tries: list[MapMatch], belief: Estimate, travelled: float
     ) -> MapMatch:
         """Judge the best of ``tries``, which fits but contradicts odometry: the place moves if the scans support that.
 
         If the two places are near enough for either to be right, the lidar is believed, without a pose until the next
-        frame agrees. Within odometry's drift there is no contradiction. If only the headings differ, odometry is wrong,
-        as moved objects do not turn about the robot. If the heights differ by more than the drift, odometry is right,
-        as no wheel slips upwards. ``T_map_predicted`` (4, 4) is by odometry, or by a match that agrees with it;
-        ``belief`` is odometry's.
+        frame agrees. Within odometry's drift there is no contradiction. If the heights differ by more than the drift,
+        odometry is right, as no wheel slips upwards. ``belief`` is odometry's.
         """
-        rule = self._config.acceptance
+        rule, T_map_predicted = self._config.acceptance, belief.T_map_body
         plausible = match.innovation <= rule.max_innovation
         metres, degrees = off_by(match.T_map_body, T_map_predicted)
         if plausible and not matters(metres, degrees):
             return match
         gap = match.T_map_body[:3, 3] - T_map_predicted[:3, 3]
-        spread = belief.covariance[3:, 3:] + match.covariance[3:, 3:]
+        spread = (belief.covariance + match.covariance + self.shared.covariance)[3:, 3:]
         rare = chi2_tail(6, rule.max_innovation)  # probability below which nothing is plausible
         here = not matters(metres, 0.0) and float(gap @ np.linalg.solve(spread, gap)) <= chi2_quantile(3, rare)
         if here and not matters(0.0, degrees):
             return replace(match, moves_place=True)
         level = gap[2] ** 2 <= chi2_quantile(1, rare) * spread[2, 2]
-        moves = here or (level and not matters(metres, degrees))  # here, but turned; or close enough
+        moves = level and not matters(metres, degrees)  # close enough
         if not moves:
             places = [other.T_map_body for other in tries if other.scan is not None]
             places += [rival.T_map_odom @ scan.T_odom_body for other in tries for rival in other.rivals]

@@ -9,6 +9,9 @@ So a clustered sandwich estimator is used: C = c H^-1 B H^-1. B is the sum, over
 and structure apart, of the outer products of their gradients, each a mean over the last metres, in which scanner noise
 averages out and map error does not. H is the derivative of the whole gradient by the pose, with all correspondences
 searched again. The fit uses up six of the eight gradients: c = 8 / (8 - 6).
+
+The scatter of the gradients about this mean is a registration's own error, independent of the next one's. On a survey
+of two points per square metre it is ten times the inverse Hessian's.
 """
 
 from __future__ import annotations
@@ -29,7 +32,7 @@ _VIEW = 5.0  # metres of driving with about the same view, over which gradients 
 _STEP = 2.0  # metres of driving between two updates
 _EVERY = 2  # every second point is used: more change nothing
 _MIN_PAIRS = 50
-_SHIFT = 0.03  # metres by which the pose is moved to search partners again: above scanner noise, below a wall's width
+_SHIFT = RESIDUAL_SCALE  # metres by which the pose is moved to search partners again: what the weights tell apart
 _LEVER = 17.0  # metres; at this lever arm a rotation moves points by _SHIFT
 _TURNS = (0.0, 0.25 * np.pi)  # radians: two cuts into quadrants, as a wall may lie along a cut
 _SECTORS = 8  # four quadrants, ground and structure apart
@@ -46,9 +49,16 @@ class SharedErrorModel:
     def clear(self) -> None:
         """Forget all registrations of the previous place."""
         self._gradients = np.zeros((len(_TURNS), _SECTORS, 6))
+        self._middle = np.zeros((6, 6))  # mean of the outer products of each registration's gradients
+        self._repeated = 1.0  # inverse of the number of registrations that the means are of
         self._curvature = np.zeros((6, 6))
         self._learned_at: float | None = None  # metres driven
         self._side = -1  # direction in which the pose is moved for the curvature, alternating
+
+    @property
+    def unknown(self) -> bool:
+        """Whether nothing was learned yet."""
+        return self._learned_at is None
 
     def learn(
         self, source: RegistrationCloud, T_map_source: Pose, target: LocalMap, pivot: Floats, travelled: float
@@ -66,26 +76,49 @@ class SharedErrorModel:
             return
         share = 1.0 if before is None else 1.0 - np.exp((before - travelled) / _VIEW)
         self._gradients += share * (now[0] - self._gradients)
+        self._middle += share * (_mean_outer(now[0]) - self._middle)
+        self._repeated = share**2 + (1.0 - share) ** 2 * self._repeated
         self._curvature += share * (now[1] - self._curvature)
         self._learned_at = travelled
 
     @property
     def covariance(self) -> Floats:
-        """(6, 6) over (rx, ry, rz, x, y, z), map axes: ``shared`` times the sandwich's sigma, and the floor."""
+        """(6, 6) over (rx, ry, rz, x, y, z), map axes: ``shared`` times the mean's sandwich, and the floor."""
         sandwich = np.zeros((6, 6))
         if self._learned_at is not None:
             sandwich = clustered_covariance(self._gradients, self._curvature)
         return np.asarray(self._config.shared**2 * sandwich + np.diag(FLOOR**2))
 
+    @property
+    def own(self) -> Floats:
+        """(6, 6) likewise: the sandwich of the scatter about the mean, which the next registration does not repeat.
+
+        The scatter of a single registration is unknown: all of its gradients count.
+        """
+        if self._learned_at is None:
+            return np.zeros((6, 6))
+        scatter = self._middle
+        if self._repeated < 1.0:
+            scatter = (scatter - _mean_outer(self._gradients)) / (1.0 - self._repeated)
+        return _sandwich(scatter, self._curvature)
+
 
 def clustered_covariance(gradients: Floats, curvature: Floats) -> Floats:
     """Return the sandwich (6, 6) of gradients (K, 8, 6), by K cuts into sectors, and the curvature (6, 6)."""
+    return _sandwich(_mean_outer(gradients), curvature)
+
+
+def _mean_outer(gradients: Floats) -> Floats:
+    """Return the sum over the sectors, as a mean over the cuts, of the gradients' outer products (6, 6)."""
+    return np.asarray(np.einsum("ksi,ksj->ij", gradients, gradients) / len(gradients))
+
+
+def _sandwich(middle: Floats, curvature: Floats) -> Floats:
     diagonal = np.diag(curvature).reshape(2, 3)  # angles, shifts
     least = np.maximum(_LEAST * diagonal.max(axis=1, keepdims=True), 1e-12)  # a direction may lack ground
     unit = 1.0 / np.sqrt(np.maximum(diagonal, least)).ravel()
     strength, directions = np.linalg.eigh(unit[:, None] * curvature * unit)
     inverse = unit[:, None] * (directions / np.maximum(strength, _LEAST)) @ directions.T * unit
-    middle = np.einsum("ksi,ksj->ij", gradients, gradients) / len(gradients)
     return np.asarray(_SECTORS / (_SECTORS - 6) * inverse @ middle @ inverse)
 
 

@@ -25,10 +25,9 @@ from coview_stream.localization.registration.register import (
     swap_rotation_translation,
 )
 from coview_stream.localization.tracking.map_matching import MapMatch, MapMatcher
-from coview_stream.localization.tracking.monitor import MatchVerdict, RejectionReason
+from coview_stream.localization.tracking.monitor import PER_METRE, MatchVerdict, RejectionReason
 from coview_stream.localization.tracking.motion import MAX_FRAMES, OdometryTracker, ScanBuffer
 from coview_stream.localization.tracking.pose_graph import Estimate, PoseGraph
-from coview_stream.localization.tracking.shared_error import SharedErrorModel
 from coview_stream.localization.tracking.slip import DisplacementCheck
 
 _MIN_POINTS = 100  # to register
@@ -41,6 +40,7 @@ _START = np.diag([np.radians(0.3), np.radians(0.3), np.radians(1.5), 0.5, 0.5, 0
 _SLIP = np.diag([np.radians(0.5), np.radians(0.5), np.radians(5.0), 1.0, 1.0, 0.3]) ** 2
 """Covariance of odometry that contradicts the lidar: slipping wheels, a carried robot."""
 
+_RARE = -math.log(PER_METRE)  # log-odds against a slip in a view
 _RISEN = np.diag([np.radians(1.0), np.radians(1.0), 0.0, 0.0, 0.0, 0.3]) ** 2
 """Covariance of a height by structure alone, and of an attitude by odometry."""
 
@@ -73,7 +73,6 @@ class Tracker:
         self._displacement = DisplacementCheck()
         self._scans = ScanBuffer(config.tracking, calibration)
         self._unregistered = 0  # frames since the newest registration
-        self._shared_error = SharedErrorModel(config.registration)
         self._learned_at = -math.inf  # metres driven when the place was last learned
         self._disputed = False  # the last match contradicted odometry
         self._held: LocalMap | None = None  # newest crop, so that robots with a shared cache do not drop each other's
@@ -131,7 +130,6 @@ class Tracker:
         self.odometry.forget_registration()
         self._doubt, self._disputed, self._learned_at = 1.0, False, -math.inf
         self._displacement.usual = None
-        self._shared_error.clear()
         registered = registration_covariance(registration.information, self.config.registration)
         T_odom_keyframe = T_odom_body if T_odom_found is None else T_odom_found
         step = registration.T_map_source[:3, :3] @ (T_odom_body[:3, 3] - T_odom_keyframe[:3, 3])
@@ -180,28 +178,26 @@ class Tracker:
         if newest_only or contradicted:
             wider = Estimate(belief.T_map_body, belief.covariance + _SLIP)
             tries = self._matcher.match_widely(match, scan, wider, target, belief)
-            match = max(tries, key=lambda attempt: (attempt.verdict.verified, attempt.verdict.ratio))
-        if match.verdict.verified and (match.innovation > limit or self._disputed or match is not tries[0]):
-            predicted = tries[0] if match.innovation <= limit and not self._disputed else belief
-            return self._matcher.against_odometry(
-                match, scan, tries, predicted.T_map_body, belief, self.odometry.travelled
-            )
+            match = max(tries, key=lambda attempt: attempt.verdict.ratio - min(0.5 * attempt.innovation, _RARE))
+        if match.verdict.verified and (match.innovation > limit or self._disputed):
+            return self._matcher.against_odometry(match, scan, tries, belief, self.odometry.travelled)
         return match
 
     def update(self, match: MapMatch, T_odom_body: Pose, believed: bool) -> None:
         """Correct the belief by a registration at the newest frame, if ``believed``."""
         verdict, T_map_cloud = match.verdict, self._of_cloud(match.T_map_body)  # before the calibration learns
+        covariance = match.covariance + self._matcher.shared.own
         if verdict.verified or verdict.cause is RejectionReason.ODOMETRY:
             self._disputed = not (verdict.verified or match.moves_place)
         if match.moves_place:
             # odometry has slipped, or drifts as usual: continue at the lidar's pose
-            self.odometry.learn_once_confirmed(T_map_cloud, match.covariance)
-            self._restart(T_map_cloud, match.covariance + self._shared_error.covariance, T_odom_body)
+            self.odometry.learn_once_confirmed(T_map_cloud, covariance)
+            self._restart(T_map_cloud, covariance + self._matcher.shared.covariance, T_odom_body)
         elif believed:
             self._matcher.dispute.clear()
-            self._graph.correct(T_map_cloud, match.covariance)
+            self._graph.correct(T_map_cloud, covariance)
             self._set_belief(T_odom_body)
-            self.risen = self._learn(match, T_odom_body[:3, 3])
+            self.risen = self._learn(match, covariance, T_odom_body[:3, 3])
             self._set_belief(T_odom_body)
             if self.risen:  # a lean measured on changed ground is wrong
                 here = self.belief
@@ -229,7 +225,7 @@ class Tracker:
         It is the sum of the cloud's by the graph and by odometry since, the error shared by registrations, the jitter
         of the tilt, the ground's and, unless left out, the errors of mount and clock.
         """
-        total = self.predicted_covariance() + self._shared_error.covariance + self.odometry.tremble
+        total = self.predicted_covariance() + self._matcher.shared.covariance + self.odometry.tremble
         total[5, 5] += self.change.others.variance + self.change.alone + self.ground.sigma**2
         if mount_and_clock:
             R = (self.T_map_odom if self.odometry.pose is None else self.T_map_odom @ self.odometry.pose)[:3, :3]
@@ -281,10 +277,11 @@ class Tracker:
     def _set_belief(self, T_odom_body: Pose) -> None:
         self.T_map_odom = self.belief.T_map_body @ inverse(T_odom_body)
 
-    def _learn(self, match: MapMatch, position: Floats) -> float:
+    def _learn(self, match: MapMatch, covariance: Floats, position: Floats) -> float:
         """Learn from a verified registration: odometry's drift, the usual shares here, and systematic errors.
 
-        Return metres by which the robot has to rise, as the ground is not the survey's.
+        ``covariance`` (6, 6) is that of the match with these errors. Return metres by which the robot has to rise, as
+        the ground is not the survey's.
         """
         verdict, scan, target, newest = match.verdict, match.scan, match.target, self._scans.newest
         evidence, observation = verdict.evidence, verdict.observation
@@ -297,9 +294,10 @@ class Tracker:
             self._learned_at = self.odometry.travelled
             self._matcher.place.learn(observation)
             self.ground.learn(scan.cloud, self.T_map_odom, target)
-            self._shared_error.learn(scan.cloud, self.T_map_odom, target, position, self.odometry.travelled)
-            climb = self.odometry.drift.variances(driven, 0.0)[5] + tilt_variance(match.covariance) * driven**2
+            fit = match.T_map_body @ inverse(scan.T_odom_body)  # the belief is off where surveys are sparse
+            self._matcher.shared.learn(scan.cloud, fit, target, position, self.odometry.travelled)
+            climb = self.odometry.drift.variances(driven, 0.0)[5] + tilt_variance(covariance) * driven**2
             rise = self.change.learn(self.T_map_odom, position, target, driven, float(climb))
         self._displacement.learn(newest, position, self.T_map_odom, target)
-        self.odometry.learn(self._of_cloud(match.T_map_body), match.covariance)
+        self.odometry.learn(self._of_cloud(match.T_map_body), covariance)
         return rise
