@@ -3,7 +3,7 @@
 The inverse Hessian is the covariance for independent residuals of one size, with fixed correspondences. But a part of
 the map lies some centimetres off the others, a tree's crown looks different from above, a lidar's far rings lie too
 high: all points of a sector pull together. And a point that is off finds another partner nearby, so a displaced fit
-looks hardly worse: on a map of several passes the gradient grows by a third of its growth with fixed correspondences.
+looks hardly worse: on a map of several passes the gradient grows less than with fixed correspondences.
 
 So a clustered sandwich estimator is used: C = c H^-1 B H^-1. B is the sum, over the quadrants around the body, ground
 and structure apart, of the outer products of their gradients, each a mean over the last metres, in which scanner noise
@@ -49,7 +49,7 @@ class SharedErrorModel:
     def clear(self) -> None:
         """Forget all registrations of the previous place."""
         self._gradients = np.zeros((len(_TURNS), _SECTORS, 6))
-        self._middle = np.zeros((6, 6))  # mean of the outer products of each registration's gradients
+        self._scatter = np.zeros((6, 6))  # of the gradients about their mean
         self._repeated = 1.0  # inverse of the number of registrations that the means are of
         self._curvature = np.zeros((6, 6))
         self._learned_at: float | None = None  # metres driven
@@ -75,8 +75,9 @@ class SharedErrorModel:
         if now is None:
             return
         share = 1.0 if before is None else 1.0 - np.exp((before - travelled) / _VIEW)
-        self._gradients += share * (now[0] - self._gradients)
-        self._middle += share * (_mean_outer(now[0]) - self._middle)
+        change = now[0] - self._gradients
+        self._scatter = (1.0 - share) * (self._scatter + share * _mean_outer(change))
+        self._gradients += share * change
         self._repeated = share**2 + (1.0 - share) ** 2 * self._repeated
         self._curvature += share * (now[1] - self._curvature)
         self._learned_at = travelled
@@ -97,9 +98,8 @@ class SharedErrorModel:
         """
         if self._learned_at is None:
             return np.zeros((6, 6))
-        scatter = self._middle
-        if self._repeated < 1.0:
-            scatter = (scatter - _mean_outer(self._gradients)) / (1.0 - self._repeated)
+        single = self._repeated == 1.0
+        scatter = _mean_outer(self._gradients) if single else self._scatter / (1.0 - self._repeated)
         return _sandwich(scatter, self._curvature)
 
 

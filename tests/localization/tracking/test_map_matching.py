@@ -73,11 +73,14 @@ def test_match_covariance_does_not_depend_on_prior_covariance(world_map, truth, 
 def test_innovation_is_measured_against_graph_prediction(world_map, truth, scan):
     """Which need not be what the match began with."""
     away = boxplus(truth, np.array([0.0, 0.0, 0.0, 0.5, 0.0, 0.0]))
-    near = matched(world_map, scan, Estimate(truth, LOOSE), Estimate(truth, TIGHT))
-    far = matched(world_map, scan, Estimate(truth, LOOSE), Estimate(away, TIGHT))
+    matcher, target = MapMatcher(world_map, CONFIG), LocalMaps(world_map, 50.0).around(truth[:3, 3])
+    near, far = (
+        matcher.match(scan, Estimate(truth, LOOSE), target, CONFIG.registration.track, Estimate(T, TIGHT))
+        for T in (truth, away)
+    )
     assert near.innovation < 1.0
     gap = boxminus(far.T_map_body, away)
-    expected = gap @ np.linalg.solve(TIGHT + far.covariance, gap)
+    expected = gap @ np.linalg.solve(TIGHT + far.covariance + matcher.shared.own + matcher.shared.covariance, gap)
     assert far.innovation == pytest.approx(expected, rel=1e-6)
     assert far.innovation > CONFIG.acceptance.max_innovation
     assert far.verdict.innovation == far.innovation
