@@ -20,7 +20,7 @@ import numpy as np
 
 import coview_kernels as kernels
 from coview_stream.config import RegistrationConfig
-from coview_stream.geometry.arrays import Floats
+from coview_stream.geometry.arrays import Floats, Ints
 from coview_stream.geometry.transforms import Points, Pose, transform
 from coview_stream.localization.registration.clouds import LocalMap, RegistrationCloud
 from coview_stream.localization.registration.register import RESIDUAL_SCALE
@@ -32,8 +32,8 @@ _VIEW = 5.0  # metres of driving with about the same view, over which gradients 
 _STEP = 2.0  # metres of driving between two updates
 _EVERY = 2  # every second point is used: more change nothing
 _MIN_PAIRS = 50
-_SHIFT = RESIDUAL_SCALE  # metres by which the pose is moved to search partners again: what the weights tell apart
-_LEVER = 17.0  # metres; at this lever arm a rotation moves points by _SHIFT
+_SHIFT = 0.03  # least metres by which the pose is moved to search partners again: above scanner noise
+_LEVER = 17.0  # metres; at this lever arm a rotation moves points as far
 _TURNS = (0.0, 0.25 * np.pi)  # radians: two cuts into quadrants, as a wall may lie along a cut
 _SECTORS = 8  # four quadrants, ground and structure apart
 _LEAST = 0.03  # least curvature of a direction relative to the others'; less is noise
@@ -137,9 +137,11 @@ def disagreement(
     source = source.every(_EVERY)
     reach, body = config.track[-1], transform(T_map_source, pivot[None])[0]
     moved = transform(T_map_source, source.points)
-    paired = kernels.nearest(target.grid, moved, reach)[0] < reach  # not trimmed, as the best pairs disagree least
+    distance, partner = kernels.nearest(target.grid, moved, reach)
+    paired = distance < reach  # not trimmed, as the best pairs disagree least
     if paired.sum() < _MIN_PAIRS:
         return None
+    shift = _disparity(moved, np.where(paired & source.above, partner, -1), target)
     # as in registration, a few points do not outweigh thousands
     few = len(source.points) // 10
     counts = [max(1, few, int((kind & paired).sum())) for kind in (source.above, ~source.above)]
@@ -147,7 +149,7 @@ def disagreement(
     arm = (moved - body).astype(np.float32)
     gradient = _gradient(moved, arm, weight, target, reach)
     total, curvature = gradient.sum(axis=0), np.empty((6, 6))
-    for axis, size in enumerate([side * _SHIFT / _LEVER] * 3 + [side * _SHIFT] * 3):
+    for axis, size in enumerate([side * shift / _LEVER] * 3 + [side * shift] * 3):
         unit = np.eye(3, dtype=np.float32)[axis % 3]
         step = np.float32(size) * (np.cross(unit, arm) if axis < 3 else unit)
         curvature[:, axis] = (_gradient(moved + step, arm, weight, target, reach).sum(axis=0) - total) / size
@@ -155,6 +157,19 @@ def disagreement(
     sectors = [2 * (np.floor((angle - turn) / (0.5 * np.pi)).astype(np.int64) % 4) + source.above for turn in _TURNS]
     gradients = [[np.bincount(sector, column, _SECTORS) for column in gradient.T] for sector in sectors]
     return np.array(gradients).transpose(0, 2, 1), 0.5 * (curvature + curvature.T)
+
+
+def _disparity(moved: Points, partner: Ints, target: LocalMap) -> float:
+    """Return the median distance, metres, of points on structure to their partners' planes; -1 for no partner.
+
+    Partners change over about this distance: a wall of the map is as thick as its points are imprecise or sparse.
+    """
+    there = np.flatnonzero(partner >= 0)
+    if len(there) < _MIN_PAIRS:
+        return _SHIFT
+    normal, _ = target.planes(partner[there])
+    off = np.einsum("ij,ij->i", moved[there] - target.points[partner[there]], normal)
+    return max(_SHIFT, float(np.median(np.abs(off))))
 
 
 def _gradient(moved: Points, arm: Points, weight: Floats, target: LocalMap, reach: float) -> Floats:
