@@ -174,10 +174,10 @@ class MapMatcher:
         try:
             of_body = registration._replace(T_map_source=T_map_odom @ scan.T_odom_body)
             T_map_body, measured = remove_prior(of_body, Prior(belief.T_map_body, information), settings)
-            covariance = scan.cloud.doubted(registration_covariance(measured, settings))
             if self.shared.unknown:  # until a verified registration tells it
                 self.shared.learn(scan.cloud, T_map_odom, target, scan.body, -np.inf)
-            innovation = predicted.innovation(T_map_body, covariance + self.shared.own + self.shared.covariance)
+            covariance = scan.cloud.doubted(registration_covariance(measured, settings)) + self.shared.own
+            innovation = predicted.innovation(T_map_body, covariance + self.shared.covariance)
         except InputError as error:
             return _failed(belief, str(error), evidence, observation)
         verdict = MatchVerdict(cause, reason, evidence, innovation, observation)

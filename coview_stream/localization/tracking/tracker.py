@@ -186,18 +186,17 @@ class Tracker:
     def update(self, match: MapMatch, T_odom_body: Pose, believed: bool) -> None:
         """Correct the belief by a registration at the newest frame, if ``believed``."""
         verdict, T_map_cloud = match.verdict, self._of_cloud(match.T_map_body)  # before the calibration learns
-        covariance = match.covariance + self._matcher.shared.own
         if verdict.verified or verdict.cause is RejectionReason.ODOMETRY:
             self._disputed = not (verdict.verified or match.moves_place)
         if match.moves_place:
             # odometry has slipped, or drifts as usual: continue at the lidar's pose
-            self.odometry.learn_once_confirmed(T_map_cloud, covariance)
-            self._restart(T_map_cloud, covariance + self._matcher.shared.covariance, T_odom_body)
+            self.odometry.learn_once_confirmed(T_map_cloud, match.covariance)
+            self._restart(T_map_cloud, match.covariance + self._matcher.shared.covariance, T_odom_body)
         elif believed:
             self._matcher.dispute.clear()
-            self._graph.correct(T_map_cloud, covariance)
+            self._graph.correct(T_map_cloud, match.covariance)
             self._set_belief(T_odom_body)
-            self.risen = self._learn(match, covariance, T_odom_body[:3, 3])
+            self.risen = self._learn(match, T_odom_body[:3, 3])
             self._set_belief(T_odom_body)
             if self.risen:  # a lean measured on changed ground is wrong
                 here = self.belief
@@ -277,11 +276,10 @@ class Tracker:
     def _set_belief(self, T_odom_body: Pose) -> None:
         self.T_map_odom = self.belief.T_map_body @ inverse(T_odom_body)
 
-    def _learn(self, match: MapMatch, covariance: Floats, position: Floats) -> float:
+    def _learn(self, match: MapMatch, position: Floats) -> float:
         """Learn from a verified registration: odometry's drift, the usual shares here, and systematic errors.
 
-        ``covariance`` (6, 6) is that of the match with these errors. Return metres by which the robot has to rise, as
-        the ground is not the survey's.
+        Return metres by which the robot has to rise, as the ground is not the survey's.
         """
         verdict, scan, target, newest = match.verdict, match.scan, match.target, self._scans.newest
         evidence, observation = verdict.evidence, verdict.observation
@@ -296,8 +294,8 @@ class Tracker:
             self.ground.learn(scan.cloud, self.T_map_odom, target)
             fit = match.T_map_body @ inverse(scan.T_odom_body)  # the belief is off where surveys are sparse
             self._matcher.shared.learn(scan.cloud, fit, target, position, self.odometry.travelled)
-            climb = self.odometry.drift.variances(driven, 0.0)[5] + tilt_variance(covariance) * driven**2
+            climb = self.odometry.drift.variances(driven, 0.0)[5] + tilt_variance(match.covariance) * driven**2
             rise = self.change.learn(self.T_map_odom, position, target, driven, float(climb))
         self._displacement.learn(newest, position, self.T_map_odom, target)
-        self.odometry.learn(self._of_cloud(match.T_map_body), covariance)
+        self.odometry.learn(self._of_cloud(match.T_map_body), match.covariance)
         return rise

@@ -80,7 +80,7 @@ def test_innovation_is_measured_against_graph_prediction(world_map, truth, scan)
     )
     assert near.innovation < 1.0
     gap = boxminus(far.T_map_body, away)
-    expected = gap @ np.linalg.solve(TIGHT + far.covariance + matcher.shared.own + matcher.shared.covariance, gap)
+    expected = gap @ np.linalg.solve(TIGHT + far.covariance + matcher.shared.covariance, gap)
     assert far.innovation == pytest.approx(expected, rel=1e-6)
     assert far.innovation > CONFIG.acceptance.max_innovation
     assert far.verdict.innovation == far.innovation
