@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -22,7 +23,7 @@ from coview_stream.localization.registration.register import (
     registration_covariance,
     remove_prior,
 )
-from coview_stream.localization.tracking.monitor import EvidenceBaseline, MatchVerdict, RejectionReason
+from coview_stream.localization.tracking.monitor import PER_METRE, EvidenceBaseline, MatchVerdict, RejectionReason
 from coview_stream.localization.tracking.place_evidence import Observation, PlaceEvidence
 from coview_stream.localization.tracking.pose_graph import Estimate
 from coview_stream.localization.tracking.shared_error import SharedErrorModel
@@ -33,6 +34,7 @@ _STRAIGHT, _TURNED = (0.0,), (-0.07, 0.0, 0.07)  # radians, turns of these poses
 _WIDEST = 1.0  # metres; the poses are locally best, so coarser scales are left out
 _EVERY = 3  # every third point is registered
 _MAX_RIVALS = 2  # of a doubtful match
+_SLIPS = -math.log(PER_METRE)  # log-odds against a slip by metres in a view of a metre
 
 
 @dataclass(frozen=True)
@@ -99,8 +101,8 @@ class MapMatch:
 
     verdict: MatchVerdict  # the decision and its reason
     T_map_body: Pose  # (4, 4) without the prior
-    covariance: Floats  # (6, 6) as in an Estimate
-    innovation: float = 0.0  # squared Mahalanobis distance from the graph's prediction
+    covariance: Floats  # (6, 6) as in an Estimate, without the error that the next registration repeats
+    innovation: float = 0.0  # squared Mahalanobis distance from the graph's prediction, by all errors
     scan: ObservedScan | None = None  # the registered scan; None if registration failed
     target: LocalMap | None = None  # the map around it; None likewise
     rivals: tuple[Rival, ...] = ()  # other poses metres away, most probable first, if searched for
@@ -120,7 +122,7 @@ class MapMatcher:
         place: evidence of the tracked place, against chance.
         dispute: evidence of the possible places while the scans contradict odometry.
         baseline: usual evidence, for reasons in words.
-        shared: error of registrations here that their own covariance leaves out.
+        shared: error of registrations here beyond the inverse Hessian.
     """
 
     def __init__(self, base_map: BaseMap, config: LocalizerConfig) -> None:
@@ -132,7 +134,7 @@ class MapMatcher:
         self.shared = SharedErrorModel(config.registration)
 
     def clear(self) -> None:
-        """Forget the usual shares of the previous place."""
+        """Forget the usual shares and errors of the previous place."""
         self.place.clear()
         self.baseline.usual = None
         self.shared.clear()
@@ -174,8 +176,9 @@ class MapMatcher:
         try:
             of_body = registration._replace(T_map_source=T_map_odom @ scan.T_odom_body)
             T_map_body, measured = remove_prior(of_body, Prior(belief.T_map_body, information), settings)
-            if self.shared.unknown:  # until a verified registration tells it
-                self.shared.learn(scan.cloud, T_map_odom, target, scan.body, -np.inf)
+            if self.shared.unknown:  # until a verified registration replaces it
+                fit = T_map_body @ inverse(scan.T_odom_body)
+                self.shared.learn(scan.cloud, fit, target, scan.body, -np.inf)
             covariance = scan.cloud.doubted(registration_covariance(measured, settings)) + self.shared.own
             innovation = predicted.innovation(T_map_body, covariance + self.shared.covariance)
         except InputError as error:
@@ -218,11 +221,10 @@ class MapMatcher:
         gap = match.T_map_body[:3, 3] - T_map_predicted[:3, 3]
         spread = (belief.covariance + match.covariance + self.shared.covariance)[3:, 3:]
         rare = chi2_tail(6, rule.max_innovation)  # probability below which nothing is plausible
-        here = not matters(metres, 0.0) and float(gap @ np.linalg.solve(spread, gap)) <= chi2_quantile(3, rare)
-        if here and not matters(0.0, degrees):
+        close = not matters(metres, degrees)
+        if close and float(gap @ np.linalg.solve(spread, gap)) <= chi2_quantile(3, rare):
             return replace(match, moves_place=True)
-        level = gap[2] ** 2 <= chi2_quantile(1, rare) * spread[2, 2]
-        moves = level and not matters(metres, degrees)  # close enough
+        moves = close and bool(gap[2] ** 2 <= chi2_quantile(1, rare) * spread[2, 2])
         if not moves:
             places = [other.T_map_body for other in tries if other.scan is not None]
             places += [rival.T_map_odom @ scan.T_odom_body for other in tries for rival in other.rivals]
@@ -264,6 +266,25 @@ class MapMatcher:
         if observation.ratio > 0.0:
             return RejectionReason.FITNESS, "what is seen fits as well metres beside"
         return self.baseline.explain(evidence)
+
+
+def best_of(tries: list[MapMatch], limit: float) -> MapMatch:
+    """Return the most probable of some matches of one scan, of which the first begins at odometry's pose.
+
+    A pose's prior is odometry's, whose innovation D counts as -D / 2, but no less than a slip's. If the best one does
+    not fit, one that fits but contradicts odometry by more than ``limit`` is returned, for the dispute.
+    """
+    usable = [each for each in tries if each.scan is not None and each.verdict.cause is not RejectionReason.TILT]
+
+    def probability(match: MapMatch) -> float:
+        observation = match.verdict.observation
+        return (0.0 if observation is None else observation.ratio) - min(0.5 * match.innovation, _SLIPS)
+
+    best = max(usable or tries, key=probability)
+    if best.verdict.verified:
+        return best
+    contrary = [each for each in usable if each.verdict.verified and each.innovation > limit]
+    return max(contrary, key=probability, default=best)
 
 
 def _failed(

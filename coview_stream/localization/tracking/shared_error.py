@@ -11,7 +11,7 @@ averages out and map error does not. H is the derivative of the whole gradient b
 searched again. The fit uses up six of the eight gradients: c = 8 / (8 - 6).
 
 The scatter of the gradients about this mean is a registration's own error, independent of the next one's. On a survey
-of two points per square metre it is ten times the inverse Hessian's.
+of two points per square metre its sigmas are ten times the inverse Hessian's.
 """
 
 from __future__ import annotations
@@ -33,6 +33,7 @@ _STEP = 2.0  # metres of driving between two updates
 _EVERY = 2  # every second point is used: more change nothing
 _MIN_PAIRS = 50
 _SHIFT = 0.03  # least metres by which the pose is moved to search partners again: above scanner noise
+_FARTHEST = 1.5 * RESIDUAL_SCALE  # farther off, the weights fall faster than residuals grow
 _LEVER = 17.0  # metres; at this lever arm a rotation moves points as far
 _TURNS = (0.0, 0.25 * np.pi)  # radians: two cuts into quadrants, as a wall may lie along a cut
 _SECTORS = 8  # four quadrants, ground and structure apart
@@ -40,7 +41,11 @@ _LEAST = 0.03  # least curvature of a direction relative to the others'; less is
 
 
 class SharedErrorModel:
-    """Running average of the pairs' disagreement by sector, and the resulting covariance."""
+    """Running mean and scatter of the pairs' disagreement by sector, and the resulting covariances.
+
+    Attributes:
+        repeats: number of registrations, so near to each other, that count as one.
+    """
 
     def __init__(self, config: RegistrationConfig) -> None:
         self._config = config
@@ -51,6 +56,7 @@ class SharedErrorModel:
         self._gradients = np.zeros((len(_TURNS), _SECTORS, 6))
         self._scatter = np.zeros((6, 6))  # of the gradients about their mean
         self._repeated = 1.0  # inverse of the number of registrations that the means are of
+        self.repeats = 1.0
         self._curvature = np.zeros((6, 6))
         self._learned_at: float | None = None  # metres driven
         self._side = -1  # direction in which the pose is moved for the curvature, alternating
@@ -63,9 +69,9 @@ class SharedErrorModel:
     def learn(
         self, source: RegistrationCloud, T_map_source: Pose, target: LocalMap, pivot: Floats, travelled: float
     ) -> None:
-        """Add a verified registration, ``travelled`` metres into the drive; other arguments as in :func:`disagreement`.
+        """Add a registration, ``travelled`` metres into the drive; other arguments as in :func:`disagreement`.
 
-        One per two metres counts, as those between see the same.
+        One per two metres counts, as those between see the same. One at -inf is replaced by the next.
         """
         before = self._learned_at
         if before is not None and travelled - before < _STEP:
@@ -100,7 +106,7 @@ class SharedErrorModel:
             return np.zeros((6, 6))
         single = self._repeated == 1.0
         scatter = _mean_outer(self._gradients) if single else self._scatter / (1.0 - self._repeated)
-        return _sandwich(scatter, self._curvature)
+        return self.repeats * _sandwich(scatter, self._curvature)
 
 
 def clustered_covariance(gradients: Floats, curvature: Floats) -> Floats:
@@ -160,7 +166,7 @@ def disagreement(
 
 
 def _disparity(moved: Points, partner: Ints, target: LocalMap) -> float:
-    """Return the median distance, metres, of points on structure to their partners' planes; -1 for no partner.
+    """Return the median distance, metres, of points to their partners' planes; ``partner`` (N,) is -1 without one.
 
     Partners change over about this distance: a wall of the map is as thick as its points are imprecise or sparse.
     """
@@ -169,7 +175,7 @@ def _disparity(moved: Points, partner: Ints, target: LocalMap) -> float:
         return _SHIFT
     normal, _ = target.planes(partner[there])
     off = np.einsum("ij,ij->i", moved[there] - target.points[partner[there]], normal)
-    return max(_SHIFT, float(np.median(np.abs(off))))
+    return min(max(_SHIFT, float(np.median(np.abs(off)))), _FARTHEST)
 
 
 def _gradient(moved: Points, arm: Points, weight: Floats, target: LocalMap, reach: float) -> Floats:

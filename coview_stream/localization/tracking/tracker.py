@@ -24,14 +24,15 @@ from coview_stream.localization.registration.register import (
     registration_covariance,
     swap_rotation_translation,
 )
-from coview_stream.localization.tracking.map_matching import MapMatch, MapMatcher
-from coview_stream.localization.tracking.monitor import PER_METRE, MatchVerdict, RejectionReason
+from coview_stream.localization.tracking.map_matching import MapMatch, MapMatcher, best_of
+from coview_stream.localization.tracking.monitor import MatchVerdict, RejectionReason
 from coview_stream.localization.tracking.motion import MAX_FRAMES, OdometryTracker, ScanBuffer
 from coview_stream.localization.tracking.pose_graph import Estimate, PoseGraph
 from coview_stream.localization.tracking.slip import DisplacementCheck
 
 _MIN_POINTS = 100  # to register
 _MIN_DISTANCE = 0.3  # metres; no uncertainty requires an earlier registration
+_LEAST_DISTANCE = 0.05  # metres; a registration nearer to the last one repeats its error, except for a sixth
 _MAX_SIGMA = 0.03  # metres of odometry's drift in x or y that require a registration
 _MAX_YAW_SIGMA = math.radians(0.2)  # likewise for its heading
 _STANDING_DRIVE = 0.2  # metres of driving that a standstill between registrations counts as
@@ -40,7 +41,6 @@ _START = np.diag([np.radians(0.3), np.radians(0.3), np.radians(1.5), 0.5, 0.5, 0
 _SLIP = np.diag([np.radians(0.5), np.radians(0.5), np.radians(5.0), 1.0, 1.0, 0.3]) ** 2
 """Covariance of odometry that contradicts the lidar: slipping wheels, a carried robot."""
 
-_RARE = -math.log(PER_METRE)  # log-odds against a slip in a view
 _RISEN = np.diag([np.radians(1.0), np.radians(1.0), 0.0, 0.0, 0.0, 0.3]) ** 2
 """Covariance of a height by structure alone, and of an attitude by odometry."""
 
@@ -152,6 +152,7 @@ class Tracker:
         frames are in doubt. ``on_doubt`` is called if the place is contradicted, some tenths of a second before the
         search around is done.
         """
+        self._matcher.shared.repeats = max(1.0, _MIN_DISTANCE / max(self.odometry.since_keyframe()[0], _LEAST_DISTANCE))
         belief = self._predict(T_odom_body, standing_still)
         self._scans.keep_newest(1 if newest_only else max(1, self._unregistered) if standing_still else MAX_FRAMES)
         self._unregistered = 0
@@ -178,7 +179,7 @@ class Tracker:
         if newest_only or contradicted:
             wider = Estimate(belief.T_map_body, belief.covariance + _SLIP)
             tries = self._matcher.match_widely(match, scan, wider, target, belief)
-            match = max(tries, key=lambda attempt: attempt.verdict.ratio - min(0.5 * attempt.innovation, _RARE))
+            match = best_of(tries, limit)
         if match.verdict.verified and (match.innovation > limit or self._disputed):
             return self._matcher.against_odometry(match, scan, tries, belief, self.odometry.travelled)
         return match
@@ -292,7 +293,7 @@ class Tracker:
             self._learned_at = self.odometry.travelled
             self._matcher.place.learn(observation)
             self.ground.learn(scan.cloud, self.T_map_odom, target)
-            fit = match.T_map_body @ inverse(scan.T_odom_body)  # the belief is off where surveys are sparse
+            fit = match.T_map_body @ inverse(scan.T_odom_body)  # without the prior, whose pull looks like disagreement
             self._matcher.shared.learn(scan.cloud, fit, target, position, self.odometry.travelled)
             climb = self.odometry.drift.variances(driven, 0.0)[5] + tilt_variance(match.covariance) * driven**2
             rise = self.change.learn(self.T_map_odom, position, target, driven, float(climb))

@@ -1,5 +1,6 @@
 """Map matching: the match against the map alone, its rivals metres away, and its weight against odometry."""
 
+from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
@@ -11,12 +12,13 @@ from coview_kernels import Prior
 from coview_stream.config import LocalizerConfig
 from coview_stream.geometry.transforms import boxminus, boxplus, inverse, pose_from, rot_z
 from coview_stream.geometry.validation import check_covariance
+from coview_stream.localization.evidence.likelihood import NUISANCES
 from coview_stream.localization.registration.clouds import LocalMaps
 from coview_stream.localization.registration.register import register
 from coview_stream.localization.tracking import map_matching
-from coview_stream.localization.tracking.map_matching import MapMatch, MapMatcher, _beside, find_rivals
-from coview_stream.localization.tracking.monitor import RejectionReason
-from coview_stream.localization.tracking.place_evidence import PlaceEvidence
+from coview_stream.localization.tracking.map_matching import MapMatch, MapMatcher, _beside, best_of, find_rivals
+from coview_stream.localization.tracking.monitor import MatchVerdict, RejectionReason
+from coview_stream.localization.tracking.place_evidence import Observation, PlaceEvidence
 from coview_stream.localization.tracking.pose_graph import Estimate
 from coview_stream.localization.tracking.slip import matters, off_by
 
@@ -195,3 +197,28 @@ def test_pose_above_or_below_is_no_rival(moved, beside):
     """Wheels slip along the ground."""
     scan = SimpleNamespace(T_odom_body=np.eye(4))
     assert _beside(scan, pose_from(np.eye(3), moved), np.eye(4)) == beside
+
+
+def made_up(world_map, scan, truth, ratio, innovation, cause=RejectionReason.VERIFIED, elsewhere=0.0):
+    """Match of some evidence, against that of another pose."""
+    likelihoods = np.zeros(NUISANCES)
+    verdict = MatchVerdict(cause, "", None, innovation, Observation(ratio, likelihoods, elsewhere))
+    return MapMatch(verdict, truth, TIGHT, innovation, scan)
+
+
+def test_slip_has_to_fit_better_by_the_odds_against_it(world_map, scan, truth):
+    limit = CONFIG.acceptance.max_innovation
+    beside = RejectionReason.FITNESS
+    here = made_up(world_map, scan, truth, 4.0, 3.0, beside)
+    assert best_of([here, slip := made_up(world_map, scan, truth, 20.0, 900.0)], limit) is slip
+    # too rare to be believed, but a contradiction that fits: the scans will decide
+    assert best_of([here, slip := made_up(world_map, scan, truth, 6.0, 900.0)], limit) is slip
+    assert best_of([here, made_up(world_map, scan, truth, 6.0, 900.0, beside)], limit) is here
+    # within odometry's uncertainty nothing contradicts it
+    assert best_of([here, made_up(world_map, scan, truth, 6.0, 20.0)], limit) is here
+    assert best_of([here, better := made_up(world_map, scan, truth, 6.0, 5.0)], limit) is better
+    fits = made_up(world_map, scan, truth, 4.0, 3.0)
+    assert best_of([fits, made_up(world_map, scan, truth, 6.0, 900.0)], limit) is fits
+    # a pose that leans, or could not be registered, is none
+    leaning = made_up(world_map, scan, truth, 30.0, 3.0, RejectionReason.TILT)
+    assert best_of([leaning, replace(leaning, scan=None), fits], limit) is fits
