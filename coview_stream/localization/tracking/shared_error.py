@@ -10,8 +10,8 @@ and structure apart, of the outer products of their gradients, each a mean over 
 averages out and map error does not. H is the derivative of the whole gradient by the pose, with all correspondences
 searched again. The fit uses up six of the eight gradients: c = 8 / (8 - 6).
 
-The scatter of the gradients about this mean is a registration's own error, independent of the next one's. On a survey
-of two points per square metre its sigmas are ten times the inverse Hessian's.
+The scatter of the gradients about this mean is a registration's own error, independent of the next one's. On a sparse
+survey it is far larger than the inverse Hessian.
 """
 
 from __future__ import annotations
