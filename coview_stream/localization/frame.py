@@ -9,7 +9,7 @@ import numpy as np
 
 import coview_kernels as kernels
 from coview_stream.config import LocalizerConfig
-from coview_stream.geometry.arrays import Floats
+from coview_stream.geometry.arrays import Floats, Reals
 from coview_stream.geometry.transforms import Points, Pose, exp_so3, inverse, log_so3, pose_from, to_local
 from coview_stream.geometry.validation import validate_cloud, validate_odometry
 from coview_stream.localization.calibration.calibration import Calibration, RawScan
@@ -18,6 +18,9 @@ from coview_stream.localization.calibration.frame_motion import FrameMotion, Var
 from coview_stream.localization.calibration.odometry_history import Moment
 from coview_stream.localization.witness.first_motions import Conventions
 
+_FASTEST = 50.0  # metres per second; no robot drives faster
+_FASTER = 3.0  # factor on the speed of the step before, as frames without stamps count as 0.1 s apart
+_SHORT_JUMP = 1.0  # metres; a shorter step is never a jump
 _PLACE_TILT = math.radians(0.5)  # sigma of roll and pitch of a frame registered at the right place
 
 
@@ -48,6 +51,8 @@ class FramePreparation:
         self._odometry = OdometryCorrection()
         self._motion = FrameMotion(config.registration, config.keyframe.distance)
         self._newest: float | None = None  # stamp of the newest frame
+        self._raw: Pose | None = None  # its odometry
+        self._speed: float | None = None  # of the newest step by odometry, metres per second
         self._limits = config.keyframe.voxel, config.keyframe.range_min
 
     @property
@@ -61,35 +66,53 @@ class FramePreparation:
         self.conventions.clear()
         self._odometry = OdometryCorrection()
         self._motion.clear()
-        self.anchor = self._newest = None
+        self.anchor = self._newest = self._raw = self._speed = None
 
     def forget_odometry(self) -> None:
         """Keep the next frame unconnected to earlier ones, as odometry may have jumped."""
         self.forget_keyframe()
         self.anchor = None
 
+    def jumps(self, T_odom_body: Pose, stamp: float) -> bool:
+        """Return whether odometry moves farther from the newest frame to this one (4, 4) than a robot drives."""
+        if self._raw is None or self._newest is None or self._speed is None:
+            return False
+        step, seconds = float(np.linalg.norm(T_odom_body[:3, 3] - self._raw[:3, 3])), stamp - self._newest
+        return step > max(_SHORT_JUMP, (_FASTEST + _FASTER * self._speed) * seconds)
+
+    def begin_odometry(self) -> None:
+        """Go on after a jump of odometry: no velocity or delay is measured across it."""
+        self.estimator.begin_odometry()
+        self.forget_odometry()
+
     def forget_keyframe(self) -> None:
         """Measure no motion from the newest keyframe to the next one."""
         self._motion.clear()
 
-    def prepare(self, cloud: Points, T_odom_body: Pose, stamp: float, drift: Variances | None = None) -> PreparedFrame:
-        """Validate and correct a frame; its arguments as in ``Localizer.step``.
-
-        ``drift`` is odometry's, to correct the motion of a keyframe by registration to the previous keyframe. It is
-        None while a place is known, as registrations to the map measure the motion better.
+    def validate(self, cloud: Reals, T_odom_body: Pose, stamp: float) -> tuple[Points, Pose]:
+        """Return a frame's finite points and its odometry, exactly rigid; the arguments as in ``Localizer.step``.
 
         Raises:
             CloudError, RunError: the frame is unusable; nothing has changed.
         """
-        raw, T_raw = validate_cloud(cloud), validate_odometry(T_odom_body, stamp, self._newest)
+        return validate_cloud(cloud), validate_odometry(T_odom_body, stamp, self._newest)
+
+    def prepare(self, raw: Points, T_raw: Pose, stamp: float, drift: Variances | None = None) -> PreparedFrame:
+        """Correct a frame whose points and odometry are valid.
+
+        ``drift`` is odometry's, to correct the motion of a keyframe by registration to the previous keyframe. It is
+        None while a place is known, as registrations to the map measure the motion better.
+        """
+        if self._raw is not None and self._newest is not None:
+            self._speed = float(np.linalg.norm(T_raw[:3, 3] - self._raw[:3, 3])) / (stamp - self._newest)
         self.estimator.search_delay()
         delay = self.calibration.delay
         history = self.estimator.history
-        before = None if self._newest is None else history.at(self._newest - delay)
+        before = history.at(self._newest - delay) if self._newest is not None and history else None
         history.add(stamp, T_raw)
         T = self._odometry.correct(history.at(stamp - delay), self.calibration, before)
         moment = Moment(stamp, history.rates(stamp - delay))
-        self._newest = stamp
+        self._newest, self._raw = stamp, T_raw
         if not self.conventions.plausible or self.conventions.finding is not None:
             self.conventions.add(self.calibration.level(raw), T_raw)
         if self.anchor is None:

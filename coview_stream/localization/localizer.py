@@ -303,9 +303,12 @@ class Localizer(SavedState):
 
     def _predict(self, cloud: Reals, T_odom_body: Pose, stamp: float) -> tuple[PreparedFrame, SearchRequest | None]:
         """Check a frame and predict its pose by odometry; return it and the search request, if no place is known."""
+        points, T_odom_raw = self._frames.validate(cloud, T_odom_body, stamp)
+        if self._frames.jumps(T_odom_raw, stamp):
+            self._follow_jump()
         searching = not self.state.has_place
         drift = self._tracker.odometry.drift.variances if searching else None
-        frame = self._newest = self._frames.prepare(cloud, T_odom_body, stamp, drift)
+        frame = self._newest = self._frames.prepare(points, T_odom_raw, stamp, drift)
         self._tracker.add_scan(frame.scan)
         if (finding := self._frames.conventions.finding) is not None:  # nothing from this sender can be believed
             self._handle(Event.PLACE_GIVEN_UP)
@@ -376,12 +379,25 @@ class Localizer(SavedState):
                 stamp, after, ruling.reason, verdict.score, 0.0, verdict.evidence,
                 cause=verdict.cause, innovation=verdict.innovation, confidence=1.0 - ruling.wrong,
             )  # fmt: skip
-        self._tracker.update(match, self._newest.T_odom_body, ruling.believed)
+        slips = self._witness.faults.odometry > 0.5
+        self._tracker.update(match, self._newest.T_odom_body, ruling.believed, slips)
         if ruling.event is not None:
             self._handle(ruling.event)
         return ruling
 
     # ---- states
+
+    def _follow_jump(self) -> None:
+        """Search anew, as odometry has jumped farther than a robot drives: it is right, or the body is where it was."""
+        if self.state.has_place and self._newest is not None:
+            here = self._tracker.T_map_odom @ self._newest.T_odom_body
+            self._handle(Event.PLACE_GIVEN_UP)
+            self._requests.hints.robot_at(here)
+        else:
+            self._requests.begin_anew()
+        self._frames.begin_odometry()
+        self._tracker.forget_odometry()
+        self._witness.forget_scan()
 
     def _handle(self, event: Event) -> None:
         """Change the state by an event (docs/tracking.md has the table)."""

@@ -18,7 +18,7 @@ from coview_stream.errors import CloudError, ConfigError, InputError, MapError, 
 from coview_stream.geometry.transforms import pose_from, rot_z
 from coview_stream.localization.localizer import Localizer
 from coview_stream.localization.search.global_search import GlobalSearch
-from coview_stream.localization.state import State
+from coview_stream.localization.state import Event, State
 from coview_stream.localization.tracking.shared_error import FLOOR
 
 UTM = np.array([512_345.6, 5_403_210.9, 287.4])
@@ -212,6 +212,28 @@ def test_late_search_result_not_fitting_newest_frame_gives_no_pose(world_map, wo
     # and what follows decides
     localizer.add_frame(world_drive.clouds[k + 3], world_drive.T_odom_body[k + 3], 0.5 * (k + 3))
     assert localizer.fix().state is State.TRACKING
+
+
+@pytest.mark.parametrize("metres", [60.0, 400.0])
+def test_place_is_given_up_where_odometry_jumps_and_found_again(world_map, world_drive, world_fixes, metres):
+    localizer, at = Localizer(world_map), 6
+    jumped = pose_from(rot_z(1.0), [metres, 5.0, 0.0])
+    for k, (cloud, T, usual) in enumerate(zip(world_drive.clouds, world_drive.T_odom_body, world_fixes, strict=False)):
+        fix = localizer.step(cloud, T if k < at else jumped @ T, 0.5 * k)
+        given_up = Event.PLACE_GIVEN_UP in localizer.take_events()
+        assert given_up == (k == at)
+        if fix.T_map_body is not None:
+            assert_pose(fix.T_map_body, world_drive.T_map_body[k], 0.08, 0.3)
+        assert k >= at or fix.state is usual.state
+    assert fix.state is State.TRACKING
+
+
+def test_steps_of_frames_without_stamps_are_no_jumps(world_map, world_drive):
+    localizer = Localizer(world_map)
+    for k, (cloud, T) in enumerate(zip(world_drive.clouds, world_drive.T_odom_body, strict=False)):
+        fix = localizer.step(cloud, T, 0.02 * k)  # 2.4 m, which would be 120 m/s
+        assert Event.PLACE_GIVEN_UP not in localizer.take_events()
+    assert fix.state is State.TRACKING
 
 
 @pytest.mark.parametrize("before", [True, False], ids=["result first", "verification first"])

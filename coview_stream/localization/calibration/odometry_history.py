@@ -35,6 +35,9 @@ class OdometryHistory:
         history._stamps, history._poses = stamps.tolist(), list(poses)
         return history
 
+    def __len__(self) -> int:
+        return len(self._stamps)
+
     def add(self, stamp: float, T_odom_body: Pose) -> None:
         """Add a pose (4, 4) at a later stamp."""
         if len(self._stamps) > 2 and self._stamps[1] < stamp - _REMEMBERED:

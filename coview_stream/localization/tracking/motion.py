@@ -210,13 +210,14 @@ class OdometryTracker:
         """Covariance (6, 6) of a frame's tilt relative to neighbouring frames; see :class:`DriftEstimator`."""
         return self._estimator.tremble
 
-    def learn(self, T_map_cloud: Pose, covariance: Floats) -> None:
+    def learn(self, T_map_cloud: Pose, covariance: Floats, slips: bool = False) -> None:
         """Learn calibration and drift from a verified registration at the newest keyframe.
 
         ``T_map_cloud`` (4, 4) and its covariance (6, 6) are of the cloud in the sensor's axes, without the prior.
+        ``slips`` as in :meth:`Tracker.update`.
         """
         self._learn_unconfirmed()
-        self._learn(_Registered(T_map_cloud, covariance, self._keyframe))
+        self._learn(_Registered(T_map_cloud, covariance, self._keyframe), slips)
 
     def learn_once_confirmed(self, T_map_cloud: Pose, covariance: Floats) -> None:
         """Learn from a registration that contradicts odometry once the next one follows; args as in :meth:`learn`."""

@@ -184,8 +184,11 @@ class Tracker:
             return self._matcher.against_odometry(match, scan, tries, belief, self.odometry.travelled)
         return match
 
-    def update(self, match: MapMatch, T_odom_body: Pose, believed: bool) -> None:
-        """Correct the belief by a registration at the newest frame, if ``believed``."""
+    def update(self, match: MapMatch, T_odom_body: Pose, believed: bool, slips: bool = False) -> None:
+        """Correct the belief by a registration at the newest frame, if ``believed``.
+
+        While odometry ``slips`` or is out of scale, its motion shows nothing of mount and clock.
+        """
         verdict, T_map_cloud = match.verdict, self._of_cloud(match.T_map_body)  # before the calibration learns
         if verdict.verified or verdict.cause is RejectionReason.ODOMETRY:
             self._disputed = not (verdict.verified or match.moves_place)
@@ -197,7 +200,7 @@ class Tracker:
             self._matcher.dispute.clear()
             self._graph.correct(T_map_cloud, match.covariance)
             self._set_belief(T_odom_body)
-            self.risen = self._learn(match, T_odom_body[:3, 3])
+            self.risen = self._learn(match, T_odom_body[:3, 3], slips)
             self._set_belief(T_odom_body)
             if self.risen:  # a lean measured on changed ground is wrong
                 here = self.belief
@@ -277,7 +280,7 @@ class Tracker:
     def _set_belief(self, T_odom_body: Pose) -> None:
         self.T_map_odom = self.belief.T_map_body @ inverse(T_odom_body)
 
-    def _learn(self, match: MapMatch, position: Floats) -> float:
+    def _learn(self, match: MapMatch, position: Floats, slips: bool) -> float:
         """Learn from a verified registration: odometry's drift, the usual shares here, and systematic errors.
 
         Return metres by which the robot has to rise, as the ground is not the survey's.
@@ -298,5 +301,5 @@ class Tracker:
             climb = self.odometry.drift.variances(driven, 0.0)[5] + tilt_variance(match.covariance) * driven**2
             rise = self.change.learn(self.T_map_odom, position, target, driven, float(climb))
         self._displacement.learn(newest, position, self.T_map_odom, target)
-        self.odometry.learn(self._of_cloud(match.T_map_body), match.covariance)
+        self.odometry.learn(self._of_cloud(match.T_map_body), match.covariance, slips)
         return rise
