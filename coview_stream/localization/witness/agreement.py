@@ -23,8 +23,11 @@ FAILS = 0.05
 """Probability that clouds are registered wrongly, given their usual fit."""
 MAP_FAILS = 0.02
 """Likewise for a verified registration to the map."""
-ALONE = 0.05
-"""Probability that clouds of one place do not fit each other."""
+ALONE, AGAIN = 0.05, 0.45
+"""Probabilities that clouds of one place do not fit each other, and that the next ones do not either.
+
+Measured on 14 drives: 2 % of 1,200 steps, 44 % of 45. Where vegetation is all that is seen, it lasts.
+"""
 ANYWHERE: Floats = np.array([2.0, 2.0, math.radians(20.0)])
 """Scale of a wrong registration about odometry's motion: metres, radians."""
 _APART = 0.7  # probability that clouds of several places do not fit each other
@@ -71,7 +74,7 @@ def likelihood(step: Step, motion: Floats, spread: Floats, alone: float) -> Floa
     if seen is None or on_map is None:
         one, fails = (seen, step.fails) if seen is not None else (on_map, MAP_FAILS)
         assert one is not None
-        wrong = _wrong(step, seen) if seen is not None else anywhere(one.motion - o)
+        wrong = _wrong(step, seen) if seen is not None else anywhere(one, o)
         likely = (1.0 - fails) * normal(one.motion - motion, one.covariance + spread)
         likely = likely + fails * wrong
     else:
@@ -81,7 +84,7 @@ def likelihood(step: Step, motion: Floats, spread: Floats, alone: float) -> Floa
         gain = L @ np.linalg.inv(L + M)
         fused = normal(seen.motion + gain @ gap - motion, L - gain @ L + spread)
         l_right, l_wrong = normal(seen.motion - motion, L + spread), _wrong(step, seen)
-        m_right, m_wrong = normal(on_map.motion - motion, M + spread), anywhere(on_map.motion - o)
+        m_right, m_wrong = normal(on_map.motion - motion, M + spread), anywhere(on_map, o)
         likely = (1.0 - step.fails) * (1.0 - MAP_FAILS) * normal(gap, L + M) * fused
         likely = likely + (1.0 - step.fails) * MAP_FAILS * l_right * m_wrong
         likely = likely + step.fails * ((1.0 - MAP_FAILS) * l_wrong * m_right + MAP_FAILS * l_wrong * m_wrong)
@@ -90,8 +93,8 @@ def likelihood(step: Step, motion: Floats, spread: Floats, alone: float) -> Floa
 
 def _wrong(step: Step, seen: Seen) -> float:
     """Return the density of the clouds' motion if they are registered wrongly: near one of its starts."""
-    density = anywhere(seen.motion - step.odometry.motion)
-    return density if step.start is None else 0.5 * (density + anywhere(seen.motion - step.start))
+    density = anywhere(seen, step.odometry.motion)
+    return density if step.start is None else 0.5 * (density + anywhere(seen, step.start))
 
 
 def at_once(step: Step, covariance: Floats) -> float:
@@ -108,14 +111,19 @@ def of_several_places(step: Step) -> float:
     """Return the likelihood of a step's clouds and map if both are registered arbitrarily."""
     likely = 1.0
     for seen in (step.clouds, step.on_map):
-        likely *= 1.0 if seen is None else anywhere(seen.motion - step.odometry.motion)
+        likely *= 1.0 if seen is None else anywhere(seen, step.odometry.motion)
     return likely if step.clouds is None else likely * (_APART if step.apart else 1.0 - _APART)
 
 
-def anywhere(gap: Floats) -> float:
-    """Return the density of a wrong registration (3,) relative to odometry's motion: Student's t, one dof."""
-    square = float((np.append(gap[:2], wrap_angle(float(gap[2]))) ** 2 / ANYWHERE**2).sum())
-    return 1.0 / (math.pi**2 * float(ANYWHERE.prod()) * (1.0 + square) ** 2)
+def anywhere(seen: Seen, start: Floats) -> float:
+    """Return the density of a wrong registration about the motion (3,) where it started: Student's t, one dof.
+
+    It is as uncertain as a right one, so where clouds show nothing, neither is favoured.
+    """
+    gap = np.append(seen.motion[:2] - start[:2], wrap_angle(float(seen.motion[2] - start[2])))
+    scales = ANYWHERE**2 + np.diag(seen.covariance)
+    square = float((gap**2 / scales).sum())
+    return 1.0 / (math.pi**2 * math.sqrt(float(scales.prod())) * (1.0 + square) ** 2)
 
 
 def normal(gap: Floats, covariance: Floats) -> Floats:

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from coview_stream.config import TrackingConfig
-from coview_stream.geometry.transforms import exp_so3, pose_from
+from coview_stream.geometry.transforms import exp_so3, pose_from, rot_z
 from coview_stream.geometry.validation import check_covariance
 from coview_stream.localization.calibration.calibration import Calibration
 from coview_stream.localization.calibration.estimator import CalibrationEstimator
@@ -178,6 +178,22 @@ def test_contradictions_in_a_row_outvote_odometry():
         ride.drive(6.0 * k)
         ride.learn(6.0 * k, confirmed=False)
     assert ride.estimator.calibration.scale == pytest.approx(0.05, abs=0.015)
+
+
+def test_motion_of_wheels_that_slip_shows_nothing_of_the_mount():
+    """In a bend odometry that is out of scale looks like a lever arm."""
+    estimator, T_map_body, odometry = CalibrationEstimator(), np.eye(4), np.eye(4)
+    tracker, correction = OdometryTracker(TrackingConfig(), estimator), OdometryCorrection()
+    for k in range(12):
+        T_odom_body = correction.correct(odometry, estimator.calibration)
+        tracker.add_pose(T_odom_body)
+        tracker.set_keyframe(T_odom_body)
+        tracker.learn(T_map_body, SEEN, slips=k > 3)
+        T_map_body = T_map_body @ pose_from(rot_z(0.3), [0.6, 0.0, 0.0])
+        odometry = odometry @ pose_from(rot_z(0.3), [0.6 if k < 3 else 0.9, 0.0, 0.0])
+    found = estimator.calibration
+    assert found.scale < -0.1
+    assert np.hypot(found.lever_x, found.lever_y) < 0.02
 
 
 def test_tilt_is_that_of_the_cloud_whatever_is_known_already():

@@ -1,5 +1,7 @@
 """Faults of clouds and odometry: synthetic drives with one fault each, and the probabilities that they get."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -235,13 +237,25 @@ def test_one_wrong_registration_that_the_map_contradicts_accuses_nobody():
 def test_clouds_of_two_places_in_turns_are_named():
     faults, rng, odometry = FaultPosterior(), np.random.default_rng(2), Odometry(5.0)
     accused = None
-    for t in np.arange(5.0, 12.0, DT):
+    for t in np.arange(5.0, 15.0, DT):
         o = moved(pose(t), pose(t + DT))
         seen = o + rng.normal(size=3) * [2.0, 2.0, 0.3]
         path = odometry.move(o)
         faults.add(Step(DT, Seen(o, NOISE), Seen(seen, NOISE), None, *path, fails=0.9, apart=True))
         accused = accused or faults.accusation(*LEVEL, RISK)
     assert accused.cause is RejectionReason.MIXED
+
+
+@pytest.mark.parametrize("apart", [0, 6])
+def test_clouds_that_show_nothing_accuse_nobody(apart):
+    """On a field registration stays where it starts; among bushes some clouds in a row do not fit each other."""
+    faults, odometry, nothing = FaultPosterior(), Odometry(5.0), np.diag([50.0, 50.0, 2.0])
+    for k, t in enumerate(np.arange(5.0, 55.0, DT)):
+        o = moved(pose(t), pose(t + DT))
+        unfit = 20 <= k < 20 + apart
+        step = Step(DT, Seen(o, NOISE), Seen(0.9 * o, nothing), None, *odometry.move(o), apart=unfit)
+        faults.add(replace(step, fails=0.9) if unfit else step)
+        assert faults.accusation(*LEVEL, RISK) is None
 
 
 def test_clouds_that_jump_back_are_no_odometry_out_of_scale():
