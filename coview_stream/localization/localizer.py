@@ -305,7 +305,14 @@ class Localizer(SavedState):
         """Check a frame and predict its pose by odometry; return it and the search request, if no place is known."""
         points, T_odom_raw = self._frames.validate(cloud, T_odom_body, stamp)
         if self._frames.jumps(T_odom_raw, stamp):
-            self._follow_jump()
+            if self.state.has_place and self._newest is not None:  # odometry is right, or the body is where it was
+                here = self._tracker.T_map_odom @ self._newest.T_odom_body
+                self._handle(Event.PLACE_GIVEN_UP)
+                self._requests.hints.robot_at(here)
+            self._requests.begin_anew()
+            self._frames.begin_odometry()
+            self._tracker.forget_odometry()
+            self._witness.forget_scan()
         searching = not self.state.has_place
         drift = self._tracker.odometry.drift.variances if searching else None
         frame = self._newest = self._frames.prepare(points, T_odom_raw, stamp, drift)
@@ -386,18 +393,6 @@ class Localizer(SavedState):
         return ruling
 
     # ---- states
-
-    def _follow_jump(self) -> None:
-        """Search anew, as odometry has jumped farther than a robot drives: it is right, or the body is where it was."""
-        if self.state.has_place and self._newest is not None:
-            here = self._tracker.T_map_odom @ self._newest.T_odom_body
-            self._handle(Event.PLACE_GIVEN_UP)
-            self._requests.hints.robot_at(here)
-        else:
-            self._requests.begin_anew()
-        self._frames.begin_odometry()
-        self._tracker.forget_odometry()
-        self._witness.forget_scan()
 
     def _handle(self, event: Event) -> None:
         """Change the state by an event (docs/tracking.md has the table)."""
