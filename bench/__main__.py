@@ -59,7 +59,8 @@ BENCHMARKS = {
         "tracking.covariance", "errors against their covariance, on real runs and simulated drives"
     ),
     "protection": Benchmark("tracking.protection", "errors against their protection levels; calibrates these"),
-    "exposure": Benchmark("tracking.exposure", "false poses per km and hour of tracking, of three benchmarks"),
+    "surveys": Benchmark("tracking.surveys", "robots on real airborne surveys of few points: found, tracked, levels"),
+    "exposure": Benchmark("tracking.exposure", "false poses per km and hour of tracking, of four benchmarks"),
     "faults": Benchmark("faults.run", "sensors that lie: false frames, the last pose, the cause being named"),
     "integrity": Benchmark("integrity.integrity", "independent first fixes: right, false, none; with exact bounds"),
     "challenge": Benchmark("integrity.challenge", "near copies for other programs, and a scorer of TUM files"),

@@ -67,6 +67,7 @@ TABLES = {
     "conditions": Table("conditions", 15, True, f"conditions {SETS_OF_TWO}"),
     "forest": Table("forest", 12, True),
     "tracking": Table("tracking", 40, True),
+    "surveys": Table("surveys", 25, True),
     "dirt": Table("accuracy --only dirt --drives 1", 15, True, "accuracy --only dirt", "one of the four drives"),
     "protection": Table(
         "protection --worlds 26", 70, True, "protection --worlds 1",

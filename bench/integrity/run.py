@@ -109,7 +109,7 @@ def _recorded(run: Run) -> Drive:
     )
 
 
-def drive_of(run: Run) -> Drive | None:
+def drive_of(run: Run, length: float = LENGTH, speed: float = SPEED) -> Drive | None:
     """Return the drive of a run from anywhere on its route, in either direction; None where there is no such street."""
     if run.group == "runs":
         return _recorded(run)
@@ -132,7 +132,7 @@ def drive_of(run: Run) -> Drive | None:
         route = lane(scene, run.drive_seed, across=bool((run.seed // 2 + run.number) % 2))
     if route is None:
         return None
-    poses = poses_along(replace(scene, route=route), LENGTH, SPEED, HEIGHT, rng(_DRIVE))
+    poses = poses_along(replace(scene, route=route), length, speed, HEIGHT, rng(_DRIVE))
     odometry = drifting_odometry(world.poses(poses), OdometryConfig(), rng(_ODOMETRY))
     lidar, noise, casters = SENSORS[run.sensor](), rng(_SENSOR), list[Caster]()
 

@@ -1,8 +1,8 @@
-"""Exposure: false poses per kilometre and per hour of tracking, over all drives of three benchmarks.
+"""Exposure: false poses per kilometre and per hour of tracking, over all drives of four benchmarks.
 
-Drives are those of ``tracking``, ``conditions`` (real runs) and ``protection``. Results that ``--work`` has of this
-code are read, the others are made. A false pose counts once from its first frame on until a right one or none; rates
-have their upper Poisson bound, 95 %.
+Drives are those of ``tracking``, ``conditions`` (real runs), ``protection`` and ``surveys``. Results that ``--work``
+has of this code are read, the others are made. A false pose counts once from its first frame on until a right one or
+none; rates have their upper Poisson bound, 95 %.
 """
 
 from __future__ import annotations
@@ -17,7 +17,10 @@ from bench.accuracy.scores import exposed, rate
 from bench.harness.rows import Row, table
 from bench.tracking.protection import WORLDS
 
-PARTS = {"tracking": "simulated, plain and with events", "conditions": "real runs", "protection": "simulated, 400 m"}
+PARTS = {
+    "tracking": "simulated, plain and with events", "conditions": "real runs", "protection": "simulated, 400 m",
+    "surveys": "real surveys of few points, simulated robots",
+}  # fmt: skip
 
 
 def options(parser: ArgumentParser) -> None:
