@@ -296,7 +296,8 @@ def _judge(base_map: BaseMap | None, config: LocalizerConfig) -> tuple[Judge, Ca
     witness = Witness(config.registration, frames.estimator)
 
     def watched(frame: Frame) -> tuple[str, str, float] | None:
-        prepared = frames.prepare(frame.points, frame.T_odom_body, frame.stamp, drift.variances)
+        points, T_odom_body = frames.validate(frame.points, frame.T_odom_body, frame.stamp)
+        prepared = frames.prepare(points, T_odom_body, frame.stamp, drift.variances)
         witness.add(prepared.stamp, prepared.cloud, prepared.scan, prepared.T_odom_raw)
         accused = witness.while_searching(drift)
         return None if accused is None else (accused.cause.value, accused.sentence, witness.faults.sensors)

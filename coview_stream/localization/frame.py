@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections import deque
 from dataclasses import dataclass
 
 import numpy as np
@@ -19,7 +20,8 @@ from coview_stream.localization.calibration.odometry_history import Moment
 from coview_stream.localization.witness.first_motions import Conventions
 
 _FASTEST = 50.0  # metres per second; no robot drives faster
-_FASTER = 3.0  # factor on the speed of the step before, as frames without stamps count as 0.1 s apart
+_FASTER = 3.0  # factor on the fastest of the steps before, as frames without stamps count as 0.1 s apart
+_BEFORE = 10  # steps
 _SHORT_JUMP = 1.0  # metres; a shorter step is never a jump
 _PLACE_TILT = math.radians(0.5)  # sigma of roll and pitch of a frame registered at the right place
 
@@ -41,18 +43,18 @@ class FramePreparation:
     Attributes:
         estimator: of the calibration; learns from registrations too.
         conventions: check of units and axes.
+        steps: check of odometry's steps.
         anchor: (3,) origin of the current odometry, near which float32 is exact; None before the first frame.
     """
 
     def __init__(self, config: LocalizerConfig) -> None:
         self.estimator = CalibrationEstimator(config.sensor_leans, config.cloud_delay, config.mount_drawn)
         self.conventions = Conventions()
+        self.steps = StepCheck()
         self.anchor: Floats | None = None
         self._odometry = OdometryCorrection()
         self._motion = FrameMotion(config.registration, config.keyframe.distance)
         self._newest: float | None = None  # stamp of the newest frame
-        self._raw: Pose | None = None  # its odometry
-        self._speed: float | None = None  # of the newest step by odometry, metres per second
         self._limits = config.keyframe.voxel, config.keyframe.range_min
 
     @property
@@ -66,19 +68,13 @@ class FramePreparation:
         self.conventions.clear()
         self._odometry = OdometryCorrection()
         self._motion.clear()
-        self.anchor = self._newest = self._raw = self._speed = None
+        self.steps = StepCheck()
+        self.anchor = self._newest = None
 
     def forget_odometry(self) -> None:
         """Keep the next frame unconnected to earlier ones, as odometry may have jumped."""
         self.forget_keyframe()
         self.anchor = None
-
-    def jumps(self, T_odom_body: Pose, stamp: float) -> bool:
-        """Return whether odometry moves farther from the newest frame to this one (4, 4) than a robot drives."""
-        if self._raw is None or self._newest is None or self._speed is None:
-            return False
-        step, seconds = float(np.linalg.norm(T_odom_body[:3, 3] - self._raw[:3, 3])), stamp - self._newest
-        return step > max(_SHORT_JUMP, (_FASTEST + _FASTER * self._speed) * seconds)
 
     def begin_odometry(self) -> None:
         """Go on after a jump of odometry: no velocity or delay is measured across it."""
@@ -103,8 +99,6 @@ class FramePreparation:
         ``drift`` is odometry's, to correct the motion of a keyframe by registration to the previous keyframe. It is
         None while a place is known, as registrations to the map measure the motion better.
         """
-        if self._raw is not None and self._newest is not None:
-            self._speed = float(np.linalg.norm(T_raw[:3, 3] - self._raw[:3, 3])) / (stamp - self._newest)
         self.estimator.search_delay()
         delay = self.calibration.delay
         history = self.estimator.history
@@ -112,7 +106,7 @@ class FramePreparation:
         history.add(stamp, T_raw)
         T = self._odometry.correct(history.at(stamp - delay), self.calibration, before)
         moment = Moment(stamp, history.rates(stamp - delay))
-        self._newest, self._raw = stamp, T_raw
+        self._newest = stamp
         if not self.conventions.plausible or self.conventions.finding is not None:
             self.conventions.add(self.calibration.level(raw), T_raw)
         if self.anchor is None:
@@ -151,6 +145,31 @@ class FramePreparation:
 
     def _voxels(self, cloud: Points, T: Pose) -> Points:
         return kernels.transform_unique(cloud, T, *self._limits)[0]
+
+
+class StepCheck:
+    """Check of odometry for jumps: steps that are longer than a robot drives. Turns on the spot are not checked."""
+
+    def __init__(self) -> None:
+        self._newest: tuple[Pose, float] | None = None  # odometry, stamp
+        self._speeds: deque[float] = deque(maxlen=_BEFORE)  # metres per second
+        self._since_jump = _BEFORE  # steps
+
+    def add(self, T_odom_body: Pose, stamp: float) -> bool:
+        """Add a frame's odometry (4, 4); return whether it has jumped.
+
+        The first step is no jump. Steps count as usual once two jumped within ten, as from place to place.
+        """
+        before, self._newest = self._newest, (T_odom_body, stamp)
+        if before is None or stamp <= before[1]:
+            return False
+        step, seconds = float(np.linalg.norm(T_odom_body[:3, 3] - before[0][:3, 3])), stamp - before[1]
+        limit = (_FASTEST + _FASTER * max(self._speeds, default=math.inf)) * seconds
+        jumped = step > max(_SHORT_JUMP, limit)
+        if not jumped or self._since_jump < _BEFORE:
+            self._speeds.append(step / seconds)
+        self._since_jump = 0 if jumped else self._since_jump + 1
+        return jumped
 
 
 class OdometryCorrection:

@@ -34,6 +34,7 @@ from coview_stream.localization.tracking.tracker import Tracker
 from coview_stream.localization.witness.first_motions import DOUBT
 from coview_stream.localization.witness.witness import Witness
 
+JUMPED = "searching anew: odometry jumped"
 _DEFERRED = 3.0  # factor on the metres and seconds between deferred registrations
 
 
@@ -304,15 +305,16 @@ class Localizer(SavedState):
     def _predict(self, cloud: Reals, T_odom_body: Pose, stamp: float) -> tuple[PreparedFrame, SearchRequest | None]:
         """Check a frame and predict its pose by odometry; return it and the search request, if no place is known."""
         points, T_odom_raw = self._frames.validate(cloud, T_odom_body, stamp)
-        if self._frames.jumps(T_odom_raw, stamp):
+        if self._frames.steps.add(T_odom_raw, stamp):
+            self._requests.odometry_jumped(None if self._newest is None else self._newest.T_odom_body)
             if self.state.has_place and self._newest is not None:  # odometry is right, or the body is where it was
                 here = self._tracker.T_map_odom @ self._newest.T_odom_body
                 self._handle(Event.PLACE_GIVEN_UP)
                 self._requests.hints.robot_at(here)
-            self._requests.begin_anew()
             self._frames.begin_odometry()
             self._tracker.forget_odometry()
-            self._witness.forget_scan()
+            self._witness.begin_odometry()
+            self._evidence = KeyframeEvidence(stamp, self.state, JUMPED, cause=RejectionReason.ODOMETRY)
         searching = not self.state.has_place
         drift = self._tracker.odometry.drift.variances if searching else None
         frame = self._newest = self._frames.prepare(points, T_odom_raw, stamp, drift)

@@ -100,6 +100,12 @@ class SearchRequests:
             self.hints.odometry_continues(T_map_odom, self._frames.anchor)
         self.begin_anew()
 
+    def odometry_jumped(self, T_odom_body: Pose | None) -> None:
+        """Restart after a jump of odometry from a pose (4, 4); the hints stay at the places that they named there."""
+        if self._frames.anchor is not None and T_odom_body is not None:
+            self.hints.odometry_jumped(self._frames.anchor, T_odom_body)
+        self.begin_anew()
+
     def begin_anew(self) -> None:
         """Forget the keyframes; the hints stay."""
         self._odometry_check.clear()

@@ -20,13 +20,15 @@ from coview_stream.geometry.protection import protection_level
 from coview_stream.geometry.transforms import Pose, inverse, yaw_of
 from coview_stream.geometry.validation import validate_cloud, validate_odometry, validate_pose
 from coview_stream.localization.calibration.calibration import Calibration
-from coview_stream.localization.localizer import checked_arguments
+from coview_stream.localization.frame import StepCheck
+from coview_stream.localization.localizer import JUMPED, checked_arguments
 from coview_stream.localization.result import Fix, KeyframeEvidence
 from coview_stream.localization.saved_state import SavedState
 from coview_stream.localization.search.acceptance import SearchResult
 from coview_stream.localization.search.hints import PlaceGuess, require_ground
 from coview_stream.localization.search.recognizers import SearchIndex
 from coview_stream.localization.state import State
+from coview_stream.localization.tracking.monitor import RejectionReason
 from coview_stream.messages.types import CloudMessage
 from coview_stream.stream.node.counters import Counters, ErrorLog, last_line
 from coview_stream.stream.node.engine_feed import EngineFeed
@@ -260,6 +262,7 @@ class Mailbox:
             else:
                 self.queue: EngineQueue = EngineQueue(_NAME, self._epoch, self.counters, self.errors)
                 self.calibration = self.earlier = None
+                self._steps = StepCheck()
             self._newest: _Frame | None = None
             self._lost: KeyframeEvidence | None = None  # set when the engine was restarted, until it tracks
             self._forget_fix()
@@ -275,6 +278,13 @@ class Mailbox:
         with self.changed:
             last = self._newest
             T = validate_odometry(T_odom_body, stamp, None if last is None else last.stamp)
+            if self._steps.add(T, stamp):
+                place = None if last is None else self.fix().T_map_body
+                self.begin(keep_calibration=True)
+                self._lost = KeyframeEvidence(stamp, State.LOST, JUMPED, cause=RejectionReason.ODOMETRY)
+                if place is not None:
+                    self.hints.offer(place, None)
+                last = None
             driven = turned = 0.0
             if last is not None:
                 step = inverse(last.T_odom_body) @ T

@@ -16,7 +16,8 @@ from coview_stream.basemap.basemap import BaseMap
 from coview_stream.config import AcceptanceConfig
 from coview_stream.errors import CloudError, ConfigError, InputError, MapError, RunError
 from coview_stream.geometry.transforms import pose_from, rot_z
-from coview_stream.localization.localizer import Localizer
+from coview_stream.localization.frame import StepCheck
+from coview_stream.localization.localizer import JUMPED, Localizer
 from coview_stream.localization.search.global_search import GlobalSearch
 from coview_stream.localization.state import Event, State
 from coview_stream.localization.tracking.shared_error import FLOOR
@@ -226,6 +227,42 @@ def test_place_is_given_up_where_odometry_jumps_and_found_again(world_map, world
             assert_pose(fix.T_map_body, world_drive.T_map_body[k], 0.08, 0.3)
         assert k >= at or fix.state is usual.state
     assert fix.state is State.TRACKING
+
+
+def test_jump_is_the_reason_until_a_search_ends(world_map, world_drive):
+    localizer = Localizer(world_map)
+    for k in range(6):
+        localizer.step(world_drive.clouds[k], world_drive.T_odom_body[k], 0.5 * k)
+    far = pose_from(np.eye(3), [100.0, 0.0, 0.0])
+    for k, odom_odom in ((6, far), (7, far @ far)):
+        request = localizer.add_frame(world_drive.clouds[k], odom_odom @ world_drive.T_odom_body[k], 0.5 * k)
+        fix = localizer.fix()
+        assert (fix.state, fix.T_map_body, fix.evidence.reason) == (State.LOST, None, JUMPED)
+        assert any(pose_error(T @ request.T_odom_body, world_drive.T_map_body[6])[0] < 3.0 for T in request.hints)
+
+
+def test_robot_that_really_moved_with_odometry_is_found_where_it_is(world_map, world_drive):
+    localizer = Localizer(world_map)
+    for k, stamp in ((0, 0.0), (1, 0.5), (2, 1.0), (9, 1.02)):  # 17 m in 0.02 s
+        fix = localizer.step(world_drive.clouds[k], world_drive.T_odom_body[k], stamp)
+    assert Event.PLACE_GIVEN_UP in localizer.take_events()
+    assert_pose(fix.T_map_body, world_drive.T_map_body[9], 0.08, 0.3)
+
+
+@pytest.mark.parametrize(
+    ("steps", "jumps"),
+    [
+        ([1, 1, 40, -40, 1], [2, 3]),  # one wrong sample
+        ([10] * 6, []),  # frames without stamps
+        ([0, 10] * 6, [1, 3]),  # from place to place, without stamps
+        ([6, 0, 6, 0, 9, 0], []),
+        ([0.1, 0.9, 0.9], []),
+    ],
+)
+def test_steps_that_no_robot_drives_are_jumps(steps, jumps):
+    check, places = StepCheck(), np.cumsum([0.0, *steps])
+    found = [check.add(pose_from(np.eye(3), [x, 0.0, 0.0]), 0.1 * k) for k, x in enumerate(places)]
+    assert np.flatnonzero(found[1:]).tolist() == jumps
 
 
 def test_steps_of_frames_without_stamps_are_no_jumps(world_map, world_drive):

@@ -18,6 +18,8 @@ from sockets import until
 from trackers import assert_same
 
 from coview_stream import AsyncLocalizer, BaseMap, CloudError, CoViewError, InputError, PlaceGuess, RunError
+from coview_stream.geometry.transforms import pose_from, rot_z
+from coview_stream.localization.localizer import JUMPED
 from coview_stream.localization.result import KeyframeEvidence
 from coview_stream.localization.state import State
 from coview_stream.stream.async_localizer import Mailbox
@@ -81,6 +83,23 @@ def test_fix_is_carried_on_by_odometry_until_it_is_too_old(worked, world_fixes):
     doubted = worked.mailbox.fix()
     assert doubted.state is State.DOUBTED
     assert doubted.evidence.reason == "no frame of the last 5.5 s has been worked on"
+
+
+def test_jump_of_odometry_withholds_the_pose_until_a_frame_has_found_it_again(worked, world_fixes):
+    for k in range(4):
+        worked.step(k)
+    jumped = pose_from(rot_z(1.0), [400.0, 0.0, 0.0])
+    worked.mailbox.add_frame(worked.drive.clouds[4], jumped @ worked.drive.T_odom_body[4], 2.0)
+    lost = worked.mailbox.fix()
+    assert (lost.state, lost.T_map_body, lost.evidence.reason) == (State.LOST, None, JUMPED)
+    job = worked.mailbox.take_job("track")
+    np.testing.assert_allclose(job.hint, world_fixes[3].T_map_body)
+    worked.mailbox.handle_result(job, worked.engines["track"].run(job), 0.0)
+    while any([worked.do("track"), worked.do("search")]):
+        pass
+    found = worked.mailbox.fix()
+    assert found.state is State.TRACKING
+    assert pose_error(found.T_map_body, worked.drive.T_map_body[4])[0] < 0.1
 
 
 def test_failure_is_raised_once_and_the_last_place_is_a_hint(worked, world_fixes):

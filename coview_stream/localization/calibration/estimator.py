@@ -468,8 +468,6 @@ class CalibrationEstimator:
             belief.walk(driven)
         motion, before = inverse(T_map_before) @ T_map_body, self.calibration
         J = motion_jacobian(step, rates, before.scale)
-        if contradicts:
-            J[:, 2:] = 0.0
         if first is not None and last is not None:
             self._delays.add(SeenMotion(motion, first.stamp, last.stamp, before, noise, J))
         if first is None or last is None or not _waits(before):

@@ -36,7 +36,7 @@ MAX_DISTANCE = 20.0
 MIN_WITHIN = 50.0
 """Metres, smallest radius of a circle to search alone: evidence is judged against the other places in it.
 
-This is the radius of a virtual scan; no robot got a pose in a circle that it was not in (``python -m bench city``).
+This is the radius of a virtual scan; no robot got a pose in 16 circles that it was not in.
 """
 
 FROM_THERE = " (from the last known place)"
@@ -155,7 +155,7 @@ class PoseHints:
     """
 
     def __init__(self) -> None:
-        self._awaited: Pose | None = None  # T_map_body at the next frame
+        self._awaited: tuple[Pose, ...] = ()  # T_map_body at the next frame
         self._known: tuple[Pose, ...] = ()
         self._leader: Pose | None = None  # leading place of the current search
         self._led: tuple[Pose, ...] = ()
@@ -166,7 +166,7 @@ class PoseHints:
 
     def clear(self) -> None:
         """Forget all hints, as a place has been accepted."""
-        self._awaited, self._known = None, ()
+        self._awaited = self._known = ()
         self.forget_leader()
         self._guess, self._guessed, self.circle = None, (), None
 
@@ -199,11 +199,21 @@ class PoseHints:
 
     def robot_at(self, T_map_body: Pose) -> None:
         """Hint that the robot will be at ``T_map_body`` (4, 4) at the next frame."""
-        self._awaited = T_map_body
+        self._awaited = (T_map_body,)
+
+    def odometry_jumped(self, anchor: Floats, T_odom_body: Pose) -> None:
+        """Hint at the body's places by all hints before a jump of odometry, with the arguments of :meth:`about`.
+
+        Guesses end, and circles, too.
+        """
+        places = tuple(T @ pose_from(np.eye(3), anchor) @ T_odom_body for T in (*self._known, *self._led))
+        places = (*self._awaited, *places)
+        self.clear()
+        self._awaited = places
 
     def odometry_continues(self, T_map_odom: Pose, anchor: Floats) -> None:
         """Hint, replacing all others, that odometry continues: ``T_map_odom`` (4, 4) about ``anchor`` (3,)."""
-        self._awaited, self._known = None, (T_map_odom @ pose_from(np.eye(3), -anchor),)
+        self._awaited, self._known = (), (T_map_odom @ pose_from(np.eye(3), -anchor),)
         self.forget_leader()
 
     def place_leads(self, T_map_odom: Pose, anchor: Floats) -> None:
@@ -221,9 +231,8 @@ class PoseHints:
 
     def about(self, anchor: Floats, T_odom_body: Pose) -> tuple[Pose, ...]:
         """Return the hints as ``T_map_odom`` about ``anchor`` (3,), at a frame of pose ``T_odom_body`` about it."""
-        if self._awaited is not None:
-            T_map_body, self._awaited = self._awaited, None
-            # level, as both frames are: the robot's lean has changed since
+        awaited, self._awaited = self._awaited, ()
+        for T_map_body in awaited:  # level, as both frames are: the robot's lean has changed since
             turn = rot_z(yaw_of(T_map_body @ inverse(T_odom_body)))
             T = pose_from(turn, T_map_body[:3, 3] - turn @ T_odom_body[:3, 3])
             self._known = (*self._known, T @ pose_from(np.eye(3), -anchor))

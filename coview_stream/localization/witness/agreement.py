@@ -26,7 +26,8 @@ MAP_FAILS = 0.02
 ALONE, AGAIN = 0.05, 0.45
 """Probabilities that clouds of one place do not fit each other, and that the next ones do not either.
 
-Measured on 14 drives: 2 % of 1,200 steps, 44 % of 45. Where vegetation is all that is seen, it lasts.
+On 14 drives 2 % of 1,200 steps after clouds that fit did not, and 44 % of 45 after clouds that did not: where
+vegetation is all that is seen, misfit lasts.
 """
 ANYWHERE: Floats = np.array([2.0, 2.0, math.radians(20.0)])
 """Scale of a wrong registration about odometry's motion: metres, radians."""
@@ -118,12 +119,12 @@ def of_several_places(step: Step) -> float:
 def anywhere(seen: Seen, start: Floats) -> float:
     """Return the density of a wrong registration about the motion (3,) where it started: Student's t, one dof.
 
-    It is as uncertain as a right one, so where clouds show nothing, neither is favoured.
+    It is as uncertain as a right one, so where clouds show nothing, neither is favoured much.
     """
     gap = np.append(seen.motion[:2] - start[:2], wrap_angle(float(seen.motion[2] - start[2])))
-    scales = ANYWHERE**2 + np.diag(seen.covariance)
-    square = float((gap**2 / scales).sum())
-    return 1.0 / (math.pi**2 * math.sqrt(float(scales.prod())) * (1.0 + square) ** 2)
+    C = np.diag(ANYWHERE**2) + seen.covariance
+    square = float(gap @ np.linalg.solve(C, gap))
+    return 1.0 / (math.pi**2 * math.sqrt(float(np.linalg.det(C))) * (1.0 + square) ** 2)
 
 
 def normal(gap: Floats, covariance: Floats) -> Floats:
@@ -138,9 +139,9 @@ def normal(gap: Floats, covariance: Floats) -> Floats:
     return np.asarray(np.exp(-0.5 * square) / np.sqrt((2.0 * math.pi) ** 3 * det))
 
 
-def density(C: Floats, sigmas: Floats) -> float:
-    """Return the density of a planar motion (3,) about zero, by sigmas (3,)."""
-    return float(normal(C, np.diag(sigmas**2)))
+def density(C: Floats, covariance: Floats) -> float:
+    """Return the density of a planar motion (3,) about zero, by a covariance (3, 3)."""
+    return float(normal(C, covariance))
 
 
 def unsure(step: Step) -> Floats | None:

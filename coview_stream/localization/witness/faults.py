@@ -257,7 +257,9 @@ class FaultPosterior:
         steady[0] += ends * sum(h.weight * float(like(compose(inverted(h.C), o))) for h in self.moved)
         if step.clouds is not None and step.on_map is not None:
             C = between(o, step.clouds.motion)
-            weight = (come + _PER_METRE * driven) * (good + slip) * float(np.mean([density(C, s) for s in _CHANGES]))
+            L = step.clouds.covariance
+            weight = (come + _PER_METRE * driven) * (good + slip)
+            weight *= float(np.mean([density(C, L + np.diag(s**2)) for s in _CHANGES]))
             weight *= float(like(step.clouds.motion, _EXACT)) / float(normal(np.zeros(3), step.clouds.covariance))
             weight *= at_once(step, step.clouds.covariance + noise)
             moved.append(_Moved(weight, C, np.sqrt(np.diag(step.clouds.covariance + noise))))
@@ -304,6 +306,10 @@ class FaultPosterior:
             metres = float(np.linalg.norm(step.clouds.motion[:2]))
             moves = metres > 3.0 * math.sqrt(float(step.clouds.covariance[0, 0]))  # else both stand still and agree
             self._moved_on = self._moved_on + metres if moves and self.stopped > _NEGLIGIBLE else 0.0
+
+    def forget_speed(self) -> None:
+        """Forget the newest step, as the next one does not continue it."""
+        self._before, self._speed = None, np.zeros(3)
 
     def corrected(self, D: Floats, delay: float, factor: float = 1.0) -> None:
         """Follow a calibration that has moved the clouds by ``D`` (3,) and changed delay and scale.

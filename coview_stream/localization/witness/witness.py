@@ -99,6 +99,13 @@ class Witness:
         """Keep the next frame from comparison with earlier ones, as its scan is about another origin."""
         self._reference = self._previous = self._newest = self._waiting = self._cloud = None
 
+    def begin_odometry(self) -> None:
+        """Compare nothing across a jump of odometry."""
+        self.forget_scan()
+        self.faults.forget_speed()
+        self._path.clear()
+        self._odometry, self._tilting = None, 0.0
+
     def add(self, stamp: float, cloud: Points, scan: RawScan, T_odom_raw: Pose) -> None:
         """Add a frame: its raw cloud (N, 3), whose array may be reused, scan, and odometry (4, 4)."""
         calibration = self._calibration  # the path is rescaled with each newer one

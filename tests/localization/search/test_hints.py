@@ -139,6 +139,20 @@ def test_place_that_led_is_one_hint_beside_the_others():
     assert hints.about(np.zeros(3), np.eye(4)) == ()
 
 
+def test_hints_stay_at_the_places_that_they_named_before_a_jump():
+    kept, anchor, T_odom_body = PoseHints(), np.array([100.0, 0.0, 0.0]), pose_from(rot_z(0.2), [3.0, 1.0, 0.0])
+    T_map_odom = pose_from(rot_z(0.3), [5.0, 1.0, 0.0])
+    kept.odometry_continues(T_map_odom, anchor)
+    kept.guess(PlaceGuess(0.0, 0.0, within=60.0))
+    kept.guessed(np.zeros(3), anchor, T_odom_body)
+    kept.odometry_jumped(anchor, T_odom_body)
+    after = pose_from(rot_z(-1.0), [400.0, 7.0, 0.0])
+    (hint,) = kept.about(np.zeros(3), after)
+    np.testing.assert_allclose(hint @ after, T_map_odom @ T_odom_body, atol=1e-9)
+    assert kept.circle is None
+    assert kept.guessed(np.zeros(3), anchor, after) == ()
+
+
 def test_hint_is_kept_until_reset(world_map, world_drive):
     localizer = Localizer(world_map)
     localizer.hint_pose(world_drive.T_map_body[0])
