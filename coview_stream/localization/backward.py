@@ -22,7 +22,7 @@ from coview_stream.localization.registration.register import swap_rotation_trans
 from coview_stream.localization.result import Fix, KeyframeEvidence
 from coview_stream.localization.search.acceptance import SearchResult
 from coview_stream.localization.search.consensus import Hypothesis
-from coview_stream.localization.state import State
+from coview_stream.localization.state import Event, State
 from coview_stream.localization.tracking.map_matching import MapMatch
 from coview_stream.localization.tracking.monitor import Ruling
 from coview_stream.localization.tracking.slip import share_on_map
@@ -137,7 +137,8 @@ def track_backward(
             fix = localizer.step(cloud, frame.T_odom_body, 2.0 * stamp - frame.fix.stamp)
         except (CloudError, RunError):
             continue
-        if not fix.state.has_place:
+        if not fix.state.has_place or Event.PLACE_GIVEN_UP in localizer.take_events():
+            fix = None
             break
         frame.backward = fix if fix.T_map_body is not None else None
         if localizer.registered is not None:

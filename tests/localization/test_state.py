@@ -174,8 +174,9 @@ def test_covered_sensor_is_doubted_and_checked_at_each_frame(tracking, world_dri
 def test_restarted_odometry_far_away_is_lost_and_relocalized(tracking, world_drive):
     """A place without a map may lie at the map's edge, but no robot drives 6,000 km between two frames."""
     anew = world_drive.seen_from(pose_from(rot_z(-2.0), [443_000.4, 5_900_000.8, -60.0]))
-    lost = tracking.step(anew.clouds[0], anew.T_odom_body[0], 3.0)
-    assert lost.evidence.cause is RejectionReason.OFF_MAP
+    tracking.add_frame(anew.clouds[0], anew.T_odom_body[0], 3.0)
+    lost = tracking.fix()
+    assert lost.evidence.cause is RejectionReason.ODOMETRY
     assert lost.state is State.LOST
     assert lost.T_map_body is None
     again = follow(tracking, anew, range(1, 5), 3.5)

@@ -55,6 +55,7 @@ class CloudMotion(NamedTuple):
     covariance: Floats  # (3, 3), wide along a tunnel
     fit: float  # share of the structure on the earlier surfaces
     usual: float  # expected fit, by earlier motions and the structure on the scan's own surfaces
+    surfaces: float  # number of the scan's points on its own surfaces
     T: Pose | None  # (4, 4) in the axes of the earlier body; None if registration fails
     same: float | None = None  # share of unmoved structure points, for a motion near zero
 
@@ -100,6 +101,7 @@ class CloudMotionMeter:
             if still[0] is not None and float(np.linalg.norm(still[0][:3, 3])) < _STAYS:
                 found.append(still)
         flat = fit_of(scan, LocalMap(*surface_points(scan_points)), np.eye(4))
+        surfaces = flat * int(scan.above.sum())
         if max(fit for *_, fit in found) < _USUAL * flat * (self._usual or 0.0):
             starts = _starts(odometry)
             fits = np.array([fit_of(scan, target, T, _COARSE) for T in starts])
@@ -109,9 +111,10 @@ class CloudMotionMeter:
             best = found[0]
         if best[0] is None:
             usual = flat * (self._usual or 0.0)
-            unknown = CloudMotion(np.zeros(3), _UNKNOWN * np.eye(3), fit_of(scan, target, odometry), usual, None)
+            fit = fit_of(scan, target, odometry)
+            unknown = CloudMotion(np.zeros(3), _UNKNOWN * np.eye(3), fit, usual, surfaces, None)
             # None unless a registration's number of pairs would be possible
-            return unknown if unknown.misfit > APART and flat * int(scan.above.sum()) >= MIN_PAIRS else None
+            return unknown if unknown.misfit > APART and surfaces >= MIN_PAIRS else None
         if self._usual is None:
             self._usual = min(1.0, best[2] / max(flat, ALIKE))  # no surfaces fit a cloud better than its own
         usual = flat * self._usual
@@ -124,7 +127,7 @@ class CloudMotionMeter:
             points = before.levelled(calibration) - before.position.astype(np.float32)
             grid = kernels.PointGrid(points)
             same = float((kernels.nearest(grid, transform(none, scan.points[rows]), _SAME)[0] < _SAME).mean())
-        return CloudMotion(motion, covariance, best[2], usual, inverse(before.T_odom_body) @ T_now, same)
+        return CloudMotion(motion, covariance, best[2], usual, surfaces, inverse(before.T_odom_body) @ T_now, same)
 
     def _registered(
         self, scan: RegistrationCloud, target: LocalMap, T_start: Pose

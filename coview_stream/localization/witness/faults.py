@@ -30,8 +30,6 @@ from coview_stream.geometry.arrays import Floats
 from coview_stream.geometry.planar import between, compose, inverted
 from coview_stream.localization.tracking.monitor import RejectionReason
 from coview_stream.localization.witness.agreement import (
-    AGAIN,
-    ALONE,
     ANYWHERE,
     Step,
     at_once,
@@ -181,7 +179,6 @@ class FaultPosterior:
     _moved_on: float = 0.0  # metres by the clouds since odometry has stood still
     _speed: Floats = field(default_factory=lambda: np.zeros(3))  # of the newest step; includes the body's tilting
     _before: tuple[float, Floats, Floats] | None = None  # seconds, odometry and clouds of the previous step
-    _apart: bool = False  # the newest clouds that were compared did not fit each other
 
     @property
     def good(self) -> float:
@@ -208,7 +205,7 @@ class FaultPosterior:
 
         def like(motion: Floats, spread: Floats = noise) -> Floats:
             """Return the likelihood of the clouds' and the map's motion, given this expected motion."""
-            return likelihood(step, motion, spread, AGAIN if self._apart else ALONE)
+            return likelihood(step, motion, spread)
 
         anything = of_several_places(step)
         kinds = [(share, np.diag((sigmas + metre * driven) ** 2)) for share, sigmas, metre in _SLIP_KINDS]
@@ -289,7 +286,6 @@ class FaultPosterior:
         total = others + longest * (1.0 - ends) * others / max(1.0 - longest, 1e-12)
         self._before = None
         if step.clouds is not None:
-            self._apart = step.apart
             self._before = step.parts[-1] if step.parts else (dt, o, step.clouds.motion)
         self._speed = np.abs(o) / dt + [0.0, 0.0, step.tilting]
         if not (math.isfinite(total) and total > 0.0):

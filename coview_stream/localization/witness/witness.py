@@ -32,7 +32,7 @@ from coview_stream.localization.tracking.monitor import RejectionReason
 from coview_stream.localization.tracking.motion import Drift
 from coview_stream.localization.tracking.pose_graph import Estimate
 from coview_stream.localization.tracking.tracker import Tracker
-from coview_stream.localization.witness.agreement import FAILS, Seen, Step
+from coview_stream.localization.witness.agreement import ALONE, FAILS, Seen, Step, misfits
 from coview_stream.localization.witness.cloud_motion import APART, CloudMotion, CloudMotionMeter
 from coview_stream.localization.witness.faults import LAGS, Accusation, FaultPosterior
 from coview_stream.localization.witness.first_motions import Conventions
@@ -266,7 +266,8 @@ class Witness:
         fails = min(0.9, FAILS * max(1.0, misfit) ** 4)
         step = Step(
             now.stamp - before.stamp, Seen(o, noise), clouds, on_map, past, present,
-            fails=fails, apart=misfit > APART, copied=now.copied, parts=parts,
+            fails=fails, apart=misfit > APART, alone=ALONE if seen is None else misfits(seen.surfaces),
+            copied=now.copied, parts=parts,
             same=None if seen is None else seen.same,
             unsure=np.array([self._unsure(before.stamp - delay), self._unsure(now.stamp - delay)]), stamps=stamps,
             start=guess, tilting=self._tilting,
