@@ -180,34 +180,33 @@ def test_contradictions_in_a_row_outvote_odometry():
     assert ride.estimator.calibration.scale == pytest.approx(0.05, abs=0.015)
 
 
-def test_motion_of_wheels_that_slip_shows_nothing_of_the_mount():
-    """In a bend odometry that is out of scale looks like a lever arm."""
+def learned_in_a_bend(turn, metres, wrong, slips, frames):
+    """Return the calibration after so many equal steps; odometry is 1.5 times too long in the steps ``wrong``.
+
+    The registrations ``slips`` are learned as those of wheels that slip.
+    """
     estimator, T_map_body, odometry = CalibrationEstimator(), np.eye(4), np.eye(4)
     tracker, correction = OdometryTracker(TrackingConfig(), estimator), OdometryCorrection()
-    for k in range(12):
+    for k in range(frames):
         T_odom_body = correction.correct(odometry, estimator.calibration)
         tracker.add_pose(T_odom_body)
         tracker.set_keyframe(T_odom_body)
-        tracker.learn(T_map_body, SEEN, slips=k > 3)
-        T_map_body = T_map_body @ pose_from(rot_z(0.3), [0.6, 0.0, 0.0])
-        odometry = odometry @ pose_from(rot_z(0.3), [0.6 if k < 3 else 0.9, 0.0, 0.0])
-    found = estimator.calibration
+        tracker.learn(T_map_body, SEEN, slips=k in slips)
+        T_map_body = T_map_body @ pose_from(rot_z(turn), [metres, 0.0, 0.0])
+        odometry = odometry @ pose_from(rot_z(turn), [metres * (1.5 if k in wrong else 1.0), 0.0, 0.0])
+    return estimator.calibration
+
+
+def test_motion_of_wheels_that_slip_shows_nothing_of_the_mount():
+    """In a bend odometry that is out of scale looks like a lever arm."""
+    found = learned_in_a_bend(0.3, 0.6, wrong=range(3, 12), slips=range(4, 12), frames=12)
     assert found.scale < -0.05
     assert np.hypot(found.lever_x, found.lever_y) < 0.02
 
 
 def test_slip_in_a_bend_teaches_no_scale_for_good():
     """Scale and lever arm look alike there, so a scale that was learned alone would move the other one afterwards."""
-    estimator, T_map_body, odometry = CalibrationEstimator(), np.eye(4), np.eye(4)
-    tracker, correction = OdometryTracker(TrackingConfig(), estimator), OdometryCorrection()
-    for k in range(24):
-        T_odom_body = correction.correct(odometry, estimator.calibration)
-        tracker.add_pose(T_odom_body)
-        tracker.set_keyframe(T_odom_body)
-        tracker.learn(T_map_body, SEEN, slips=11 <= k < 14)
-        T_map_body = T_map_body @ pose_from(rot_z(0.15), [1.0, 0.0, 0.0])
-        odometry = odometry @ pose_from(rot_z(0.15), [1.5 if 10 <= k < 13 else 1.0, 0.0, 0.0])
-    found = estimator.calibration
+    found = learned_in_a_bend(0.15, 1.0, wrong=range(10, 13), slips=range(11, 14), frames=24)
     assert abs(found.scale) < 0.05
     assert np.hypot(found.lever_x, found.lever_y) < 0.05
 
