@@ -82,7 +82,6 @@ _MOTION = np.array([2, 3, 6, 7, 8, 9])  # components that affect a motion
 _FAULTY = {count: np.array(list(itertools.product([False, True], repeat=count))) for count in (1, 5)}
 """Choices (M, groups) of faulty groups."""
 _DELAY, _BUT_DELAY = (np.arange(SIZE) == 6).astype(float), (np.arange(SIZE) != 6).astype(float)
-_ODOMETRY = np.isin(np.arange(SIZE), (2, 3)).astype(float)
 _FREE = 1e6  # variance, in units of the wide prior's, of a component that is left free
 _GUESSED = 0.9  # probability that a mount with only its angles stated is off by more than a drawing's tolerance
 _STEPPED = 0.5  # probability of a fault where there is evidence of a step
@@ -468,10 +467,12 @@ class CalibrationEstimator:
             belief.walk(driven)
         motion, before = inverse(T_map_before) @ T_map_body, self.calibration
         J = motion_jacobian(step, rates, before.scale)
+        if contradicts:
+            J[:, 2:] = 0.0
         if first is not None and last is not None:
             self._delays.add(SeenMotion(motion, first.stamp, last.stamp, before, noise, J))
         if first is None or last is None or not _waits(before):
-            self._learn_motion(motion, step, J, noise, before, _ODOMETRY if contradicts else _BUT_DELAY)
+            self._learn_motion(motion, step, J, noise, before, _BUT_DELAY)
         now = self.calibration
         moved = J @ (_motion_part(now) - _motion_part(before))
         t = np.append(step[:2, 3] + moved[:2], (1.0 + now.scale) / (1.0 + before.scale) * step[2, 3])

@@ -217,7 +217,9 @@ class OdometryTracker:
         ``slips`` as in :meth:`Tracker.update`.
         """
         self._learn_unconfirmed()
-        self._learn(_Registered(T_map_cloud, covariance, self._keyframe), slips)
+        if slips:
+            self._registered = None
+        self._learn(_Registered(T_map_cloud, covariance, self._keyframe))
 
     def learn_once_confirmed(self, T_map_cloud: Pose, covariance: Floats) -> None:
         """Learn from a registration that contradicts odometry once the next one follows; args as in :meth:`learn`."""

@@ -187,7 +187,7 @@ class Tracker:
     def update(self, match: MapMatch, T_odom_body: Pose, believed: bool, slips: bool = False) -> None:
         """Correct the belief by a registration at the newest frame, if ``believed``.
 
-        While odometry ``slips`` or is out of scale, its motion shows nothing of mount and clock.
+        While odometry ``slips`` or is out of scale, nothing is learned from its motion.
         """
         verdict, T_map_cloud = match.verdict, self._of_cloud(match.T_map_body)  # before the calibration learns
         if verdict.verified or verdict.cause is RejectionReason.ODOMETRY:
