@@ -35,7 +35,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--run", type=Path, dest="run_path", metavar="RUN", help="recorded run to judge, and to search for on the map"
     )
     recorded.add_argument("--odometry", default="auto", metavar="auto|FILE|kiss-icp", help="as for locate (auto)")
-    add_shared(recorded, "--mount", "--cloud-delay", "--cloud-topic", "--odometry-topic")
+    add_shared(recorded, "--cloud-delay", "--cloud-topic", "--odometry-topic")
+    add_shared(parser, "--mount")
     add_network(parser, "not checked, but with --robot --connect tcp/127.0.0.1:7447")
     parser.add_argument("--seconds", type=float, default=3.0, metavar="S", help="seconds to listen to robots (3)")
     keys = parser.add_argument_group("keys and encodings, as for serve")
@@ -131,7 +132,7 @@ def _findings(args: argparse.Namespace, keys: list[RobotKeys]) -> Iterator[Findi
     if heard is not None:
         from coview_stream.doctor.network_checks import robots_findings
 
-        yield from robots_findings(heard, sha256)
+        yield from robots_findings(heard, sha256, mount_of(args))
 
 
 def _listen(

@@ -9,6 +9,7 @@ from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from difflib import SequenceMatcher
 
+from coview_stream.config.mount import Mount
 from coview_stream.doctor.capture import Codecs, RobotCapture, Wait, capture_cloud, capture_odometry, capture_robots
 from coview_stream.doctor.finding import Finding
 from coview_stream.doctor.frame_checks import frame_findings
@@ -261,15 +262,18 @@ def listen(
     return Heard(captures, candidates, {token.split("/")[-2] for token in tokens if "/" in token})
 
 
-def robots_findings(heard: Heard, sha256: str | None = None) -> Iterator[Finding]:
-    """Judge each robot, with the map's ``sha256`` if a map is checked; without robots, list those that send."""
+def robots_findings(heard: Heard, sha256: str | None = None, mount: Mount | None = None) -> Iterator[Finding]:
+    """Judge each robot, its clouds as a node with ``mount`` takes them; without robots, list those that send.
+
+    ``sha256`` is of the map to check, if any.
+    """
     for capture in heard.captures:
         k = capture.keys
         others = heard.served - {k.robot}
         yield from cloud_findings(capture, candidates_text(heard.candidates, "cloud", k.cloud, others))
         yield from odometry_findings(capture, candidates_text(heard.candidates, "odometry", k.odometry, others))
         yield from cross_findings(capture)
-        yield from frame_findings(captured_frames(capture), k.robot)
+        yield from frame_findings(captured_frames(capture, mount), k.robot, mount)
         yield node_finding(capture, sha256)
     if not heard.captures:
         texts = [text for channel in ("cloud", "odometry") if (text := candidates_text(heard.candidates, channel))]

@@ -11,6 +11,7 @@ from typing import Any
 
 import numpy as np
 
+from coview_stream.config.mount import Mount
 from coview_stream.config.node import NodeConfig
 from coview_stream.doctor.capture import CapturedMessage, RobotCapture
 from coview_stream.doctor.finding import Finding, Verdict
@@ -290,8 +291,9 @@ def pairing_finding(
     return Finding("ok" if paired >= _MIN_PAIRED * len(clouds) else "warn", "pairing", found, robot=robot)
 
 
-def captured_frames(capture: RobotCapture) -> list[SeenFrame]:
-    """Return the sampled clouds, each with the odometry nearest to its stamp."""
+def captured_frames(capture: RobotCapture, mount: Mount | None = None) -> list[SeenFrame]:
+    """Return the sampled clouds, by ``mount`` in the body frame, each with the odometry nearest to its stamp."""
+    mount = mount or Mount()
     odometry = [(m.stamp_ns or 0, m.T_odom_body) for m in capture.odometry if m.T_odom_body is not None]
     odometry.sort(key=lambda item: item[0])
     clouds = [m for m in capture.clouds if m.cloud is not None and m.stamp_ns is not None]
@@ -302,7 +304,8 @@ def captured_frames(capture: RobotCapture) -> list[SeenFrame]:
     for message in clouds[:: -(-len(clouds) // _MAX_FRAMES)]:
         nearest = int(np.argmin(np.abs(stamps - (message.stamp_ns or 0))))
         if abs(int(stamps[nearest]) - (message.stamp_ns or 0)) < _NEAREST_NS and message.cloud is not None:
-            frames.append(SeenFrame((message.stamp_ns or 0) * 1e-9, message.cloud, odometry[nearest][1]))
+            points = mount.to_body(message.cloud)
+            frames.append(SeenFrame((message.stamp_ns or 0) * 1e-9, points, odometry[nearest][1]))
     return frames
 
 

@@ -3,9 +3,11 @@
 import json
 import socket
 
+import numpy as np
 import pytest
 from captured_robot import KEYS, cloud, odometry, steps
 
+from coview_stream.config.mount import parse_mount
 from coview_stream.doctor.network_checks import (
     Candidate,
     candidates_text,
@@ -70,6 +72,17 @@ def test_findings_of_a_robot_and_its_node():
     assert "SEARCHING: too few keyframes" in found[-1].found
     assert net.raised == []
     assert set(net.subscribed) == {KEYS.cloud, KEYS.odometry, KEYS.status}  # no other robot's are asked for
+
+
+@pytest.mark.parametrize(("mount", "verdict"), [(None, "FAIL"), ("180,0,0", "ok")])
+def test_clouds_are_judged_as_a_node_with_the_mount_takes_them(mount, verdict):
+    floor = np.random.default_rng(2).uniform([-15.0, -15.0, 1.49], [15.0, 15.0, 1.51], (4000, 3)).astype(np.float32)
+    sent = [
+        *((t, odometry(t, np.eye(4))) for t in steps(50)),
+        *((t + 0.05, cloud(t, np.concatenate([floor, 0.3 * floor - 3.0]))) for t in steps(10)),
+    ]
+    found = findings(MemoryTransport(), sent, mount=mount and parse_mount(mount))
+    assert [f.verdict for f in found if f.what in ("ground", "mount")] == [verdict]
 
 
 def test_messages_after_the_capture_are_not_counted():
