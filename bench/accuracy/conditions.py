@@ -254,6 +254,7 @@ def located(real: RealSet, condition: str, site: Path, below: Path) -> dict[str,
     place = condition.replace(":", "_")
     run, out = below / "runs" / real.name / place / "run", below / "located" / site.stem / place
     spec = {"set": real.name, "condition": condition, "bench": fingerprint("bench/accuracy/conditions.py")}
+    scoring = fingerprint("bench/accuracy/scores.py")
     remembered(run.parent / "spoilt.json", spec, lambda: real.spoil(condition, run.parent))
 
     def make() -> dict[str, Any]:
@@ -261,7 +262,7 @@ def located(real: RealSet, condition: str, site: Path, below: Path) -> dict[str,
         scores = scored(read_tum(trajectory(site, run, out)), read_tum(run.parent / "truth.tum"))
         return {**scores, "locate_s": round(time.perf_counter() - begin, 1)}
 
-    return remembered(out / "scores.json", spec | {"code": fingerprint()}, make)
+    return remembered(out / "scores.json", spec | {"code": fingerprint(), "scoring": scoring}, make)
 
 
 def by_paper(real: RealSet, condition: str, site: Path, below: Path) -> dict[str, Any]:

@@ -102,6 +102,11 @@ def losses(states: Sequence[str]) -> int:
     return sum(state == "LOST" != before for before, state in itertools.pairwise(states))
 
 
+def times(false: Bools) -> int:
+    """Count the times at which frames (N,) begin to be false."""
+    return int((np.diff(false.astype(int), prepend=0) == 1).sum())
+
+
 def score(track: Track, truth: Floats, driven: Floats, events: Sequence[int]) -> dict[str, Any]:
     """Return all figures of one drive except coverage; metres, degrees, seconds; None without a pose.
 
@@ -113,7 +118,7 @@ def score(track: Track, truth: Floats, driven: Floats, events: Sequence[int]) ->
         "driven_m": float(driven[-1]),
         "tracked_m": float(np.diff(driven, prepend=driven[0])[known].sum()),
         "tracked_s": float(held(track.stamps)[known].sum()),
-        "false_times": int((np.diff(false.astype(int), prepend=0) == 1).sum()),
+        "false_times": times(false),
         "right_percent": 100 * float(error.right.mean()),
         "first_fix_m": float(driven[known.argmax()]) if known.any() else None,
         "rmse_m": rms(error.metres[known]),

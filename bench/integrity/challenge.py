@@ -16,6 +16,7 @@ import shutil
 import sys
 from argparse import ArgumentParser, Namespace
 from collections.abc import Iterator, Sequence
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -40,19 +41,24 @@ def name_of(run: Run) -> str:
 
 
 def make(run: Run, below: Path) -> bool:
-    """Write the map, the run and the truth unless they are there; return whether the run exists."""
+    """Write the map, the run and the truth unless this code has; return whether the run exists."""
     out = below / name_of(run)
-    if (truth := out / "truth.tum").is_file():
-        return True
-    if (drive := drive_of(run)) is None:
-        return False
-    (out / "run" / "frames").mkdir(parents=True, exist_ok=True)
-    write_cloud(out / "map.laz", cloud_of(run))
-    for k in range(len(drive)):
-        write_cloud(out / "run" / "frames" / f"{k:06d}.pcd", drive.frame(k))
-    write_tum(out / "run" / "odometry.tum", drive.stamps, drive.odometry)
-    write_tum(truth, *((drive.stamps, drive.truth) if drive.truth is not None else (np.zeros(0), np.zeros((0, 4, 4)))))
-    return True
+
+    def work() -> dict[str, bool]:
+        shutil.rmtree(out, ignore_errors=True)
+        if (drive := drive_of(run)) is None:
+            return {"exists": False}
+        (out / "run" / "frames").mkdir(parents=True)
+        write_cloud(out / "map.laz", cloud_of(run))
+        for k in range(len(drive)):
+            write_cloud(out / "run" / "frames" / f"{k:06d}.pcd", drive.frame(k))
+        write_tum(out / "run" / "odometry.tum", drive.stamps, drive.odometry)
+        nowhere = np.zeros(0), np.zeros((0, 4, 4))
+        write_tum(out / "truth.tum", *(nowhere if drive.truth is None else (drive.stamps, drive.truth)))
+        return {"exists": True}
+
+    made_by = fingerprint("coview_stream/sim", "bench/integrity")
+    return bool(remembered(below / f"{name_of(run)}.json", {"code": made_by, "run": asdict(run)}, work)["exists"])
 
 
 def score(answer: Path, truth: Path) -> dict[str, Any]:

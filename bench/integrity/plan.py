@@ -13,7 +13,7 @@ from typing import Literal
 import numpy as np
 
 Group = Literal["calibration", "reported", "surveys", "runs"]
-Class = Literal["ordinary", "outside", "near copies"]
+Class = Literal["ordinary", "outside", "near copies", "gap", "real run"]
 
 LIDARS = ("vlp16", "mid360", "os64")
 FIRST_SEED = {"calibration": 41_000, "reported": 261_000, "surveys": 361_000}  # new after a run has changed the product
@@ -51,7 +51,7 @@ FAMILIES: dict[str, Class] = {
     "boxes": "near copies",  # 24 x 40 equal boxes, driven along or across
     "avenue": "near copies",  # facades, trees or walls that are the same all along
     "court": "near copies",  # court of 4-fold symmetry
-    "mirrored": "near copies",  # the map mirrored: every fix is false
+    "mirrored": "outside",  # the map mirrored: every fix is false
     "shifted": "near copies",  # all buildings 4 m off: right by ground and trees
     "old": "near copies",  # 50 % of buildings, trees, cars and poles others
     "scaled": "near copies",  # the map 3-5 % too large or small: right under the same scaling
@@ -60,9 +60,9 @@ FAMILIES: dict[str, Class] = {
     "survey": "ordinary",  # the map is one half of a real survey, the world the other half
     "survey elsewhere": "outside",  # another square of the same survey, or another survey: every fix is false
     "survey shifted": "near copies",  # all that is solid 4 m off: right by ground and trees
-    "survey gap": "near copies",  # 40 m around the drive are not on the map, the rest of its rows of houses is
+    "survey gap": "gap",  # 40 m around the drive are not on the map, the rest of its rows of houses is
     "survey twice": "near copies",  # a block of 80 m around the drive is on the map twice
-    "real run": "ordinary",  # a recorded run from any of its frames, forwards or back, on its map
+    "real run": "real run",  # a recorded run from any of its frames, forwards or back, on its map
 }  # fmt: skip
 """Class of each family of runs."""
 

@@ -191,6 +191,7 @@ def first_fix(robot: Robot, drive: Drive) -> Result:
     stated error, and whether the most probable place was right.
     """
     robot.localizer.reset()
+    robot.search.reset()  # a search that goes on pays for its earlier starts
     said, way, searched = "", drive.driven, list[tuple[float, float, bool]]()
     out: Result = {"outcome": "none", "state": robot.localizer.state.value, "searched": searched}
     for k, stamp in enumerate(drive.stamps):
@@ -271,8 +272,14 @@ def on_site(
         if time.monotonic() > until:
             raise _UnkeptError([])
         new.append(site)
-        robot = Robot(map_of(site[0]))
-        results = [run | {"place": place(case)} | one(case, robot) for run, case in zip(about, site, strict=True)]
+        try:
+            robot = Robot(map_of(site[0]))
+        except BlockingIOError as error:  # no process can be started; it is not the lock of another one
+            raise RuntimeError(str(error)) from error
+        results = [
+            run | {"place": place(case), "ground": ground(case)} | one(case, robot)
+            for run, case in zip(about, site, strict=True)
+        ]
         if any(result["outcome"] == "failed" for result in results):
             raise _UnkeptError(results)
         return {"runs": results}
@@ -303,6 +310,11 @@ def place(run: Run) -> str:
     if run.group == "surveys":
         return surveys.place_of(run.seed).stem
     return run.kind if run.group == "runs" else ""
+
+
+def ground(run: Run) -> str:
+    """Return the part of the earth, or of a simulator, that a run's map shows: squares of a survey may overlap."""
+    return surveys.block_of(run.seed) if run.group == "surveys" else f"{run.kind}-{run.seed}"
 
 
 def map_of(run: Run) -> BaseMap:

@@ -108,6 +108,12 @@ def place_of(seed: int) -> Path:
     return _place(seed, None)[0]
 
 
+def block_of(seed: int) -> str:
+    """Return the block of the survey, one square large, that a square's middle is in."""
+    file, middle, _ = _place(seed, None)
+    return f"{file.stem} {middle[0] // SIZE:.0f} {middle[1] // SIZE:.0f}"
+
+
 def _cells(xyz: Floats, size: float) -> int:
     return len(np.unique(np.floor(xyz[:, :2] / size), axis=0))
 

@@ -158,7 +158,7 @@ def rows(asked: Namespace) -> Iterator[Row]:
         drives.append(figures)
         parts.append(squared)
         rmse = np.nan if figures["rmse_m"] is None else figures["rmse_m"]
-        yield informs(f"tracking/{scenario.name}", rmse, "m", figures)
+        yield informs(f"tracking/{scenario.name}", rmse, "m", figures | {"way": scenario.world.name})
     found = shares(pooled(parts))
     yaw = 100 * (found["all"]["yaw"]["inside"] or [np.nan])[0]
     yield informs("tracking/poses whose yaw is within one sigma", yaw, "%", {"coverage": found})

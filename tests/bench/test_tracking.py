@@ -7,6 +7,7 @@ from drives_with_truth import track, way
 from bench.accuracy.scores import errors, exposed, losses, rate, recovery, score
 from bench.tracking import protection, smoothing, tracking
 from bench.tracking.covariance import BAND, figures, judge
+from bench.tracking.exposure import counted
 from bench.tracking.protection import PARTS, PRODUCT, Sample, beyond_alert_limit, blocks, conformal, misleading
 from bench.tracking.tracking import AXES, NOMINAL, coverage, pooled, shares, since_fix, spread, squares
 from coview_stream.geometry.protection import protection_level
@@ -181,6 +182,14 @@ def test_rate_has_its_poisson_bound():
         "0 in 0.50 km and 0.03 h of tracking: 0 (below 6) per km, 0 (below 1.1e+02) per hour"
     )
     assert exposed("x", "false", 0, []).text.endswith("tracking: - per km, - per hour")
+
+
+def test_replays_of_one_way_are_no_further_kilometres():
+    drives = [row(way=way) | {"false_times": false} for way, false in (("a", 0), ("a", 2), ("b", 0))]
+    found = counted("x", drives).details
+    assert (found["drives"], found["ways"]) == (3, 2)
+    assert found["km_once"] == pytest.approx(2 / 3 * found["km"])
+    assert (found["events"], found["events_once"]) == (2, 2)
 
 
 def test_a_pose_beyond_the_alert_limit_misleads_unless_it_is_withdrawn_in_time():
