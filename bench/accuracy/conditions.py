@@ -253,8 +253,7 @@ def located(real: RealSet, condition: str, site: Path, below: Path) -> dict[str,
     """Localize a set under a condition on a map with the command, unless a result exists; return its scores."""
     place = condition.replace(":", "_")
     run, out = below / "runs" / real.name / place / "run", below / "located" / site.stem / place
-    spec = {"set": real.name, "condition": condition, "bench": fingerprint("bench/accuracy/conditions.py")}
-    scoring = fingerprint("bench/accuracy/scores.py")
+    spec = _spec(real, condition)
     remembered(run.parent / "spoilt.json", spec, lambda: real.spoil(condition, run.parent))
 
     def make() -> dict[str, Any]:
@@ -262,7 +261,14 @@ def located(real: RealSet, condition: str, site: Path, below: Path) -> dict[str,
         scores = scored(read_tum(trajectory(site, run, out)), read_tum(run.parent / "truth.tum"))
         return {**scores, "locate_s": round(time.perf_counter() - begin, 1)}
 
-    return remembered(out / "scores.json", spec | {"code": fingerprint(), "scoring": scoring}, make)
+    return remembered(out / "scores.json", spec | {"scoring": fingerprint("bench/accuracy/scores.py")}, make)
+
+
+def _spec(real: RealSet, condition: str) -> dict[str, Any]:
+    """Name the data and the code that a spoilt run is made of."""
+    sizes = [file.stat().st_size for file in (real.survey, real.folder / "truth.tum")]
+    code = fingerprint(), fingerprint("bench/accuracy/conditions.py")
+    return {"set": real.name, "condition": condition, "code": code, "bytes": sizes}
 
 
 def by_paper(real: RealSet, condition: str, site: Path, below: Path) -> dict[str, Any]:
@@ -273,12 +279,7 @@ def by_paper(real: RealSet, condition: str, site: Path, below: Path) -> dict[str
     def make() -> dict[str, Any]:
         return paper.located(BaseMap.load(site), open_run(world / "run"), read_tum(world / "truth.tum")[1])
 
-    spec = {
-        "set": real.name,
-        "condition": condition,
-        "code": fingerprint(),
-        "bench": fingerprint("bench/accuracy/paper.py"),
-    }
+    spec = _spec(real, condition) | {"paper": fingerprint("bench/accuracy/paper.py")}
     return remembered(below / "located" / site.stem / place / "paper.json", spec, make)
 
 

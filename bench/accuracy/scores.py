@@ -135,11 +135,7 @@ def score(track: Track, truth: Floats, driven: Floats, events: Sequence[int]) ->
 def exposed(bench: str, event: str, events: int, drives: Sequence[dict[str, Any]]) -> Row:
     """Return the row that puts events beside the kilometres and hours of the drives with a pose, as :func:`score`."""
     km, hours = (sum(drive[key] for drive in drives) / unit for key, unit in (("tracked_m", 1e3), ("tracked_s", 3.6e3)))
-    rates = [f"{rate(events, exposure)} per {unit}" for exposure, unit in ((km, "km"), (hours, "hour"))]
-    text = f"{events} in {km:.2f} km and {hours:.2f} h of tracking: {', '.join(rates)}"
-    row = judged(f"{bench}/{event}, times", text, "", None, events)
-    row.details.update(km=km, hours=hours, events=events)
-    return row
+    return judged(f"{bench}/{event}, times", f"{events} in {km:.2f} km and {hours:.2f} h of tracking", "", None, events)
 
 
 def rate(events: int, exposure: float) -> str:

@@ -34,7 +34,7 @@ WORLDS = (
     World("long-forest", "os64", 6002, 520.0, 2000.0, 4.0, 0.01),
     World("closed-forest", "vlp16", 6001, 300.0, 400.0, 2.0, 0.01),
 )
-_MADE_BY = ("bench/forest/variants.py", "bench/tracking/drives.py")
+_MADE_BY = ("bench/forest/variants.py", "bench/tracking/drives.py", "bench/tracking/worlds.py")
 _EVERY = 2  # of the frames: five a second
 _QUICK = 30.0  # metres of the first
 

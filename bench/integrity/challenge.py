@@ -22,9 +22,9 @@ from typing import Any
 
 import numpy as np
 
-from bench.harness.files import built, fingerprint, folder, remembered, trajectory
+from bench.harness.files import built, folder, remembered, trajectory
 from bench.harness.rows import Row, informs, judged, table
-from bench.integrity.integrity import Tally, percent, planned
+from bench.integrity.integrity import Tally, code_of_runs, percent, planned, with_data
 from bench.integrity.plan import FAMILIES, Run
 from bench.integrity.run import Result, cloud_of, drive_of
 from bench.integrity.run import judged as outcome
@@ -57,8 +57,11 @@ def make(run: Run, below: Path) -> bool:
         write_tum(out / "truth.tum", *(nowhere if drive.truth is None else (drive.stamps, drive.truth)))
         return {"exists": True}
 
-    made_by = fingerprint("coview_stream/sim", "bench/integrity")
-    return bool(remembered(below / f"{name_of(run)}.json", {"code": made_by, "run": asdict(run)}, work)["exists"])
+    return bool(remembered(out / "made.json", _spec(run), work)["exists"])
+
+
+def _spec(run: Run) -> dict[str, object]:
+    return with_data(code_of_runs()) | {"run": asdict(run)}
 
 
 def score(answer: Path, truth: Path) -> dict[str, Any]:
@@ -87,7 +90,7 @@ def locate(run: Run, below: Path, answers: Path) -> None:
         shutil.copyfile(found, out.with_suffix(".tum"))
 
     try:
-        remembered(out.with_suffix(".json"), {"code": fingerprint()}, work)
+        remembered(out.with_suffix(".json"), _spec(run), work)
     except InputError as error:
         out.with_suffix(".tum").unlink(missing_ok=True)
         print(error, file=sys.stderr)

@@ -76,8 +76,8 @@ class Tally:
 
     @property
     def fix_bound(self) -> float:
-        """Upper bound, at 95 %, of the share of false ones among the first fixes."""
-        return upper(self.false, self.false + self.right)
+        """Upper bound, at 95 %, of the share of false ones among the first fixes; NaN without one."""
+        return upper(self.false, self.false + self.right) if self.false + self.right else np.nan
 
     @property
     def site_bound(self) -> float:
@@ -207,7 +207,7 @@ def rows(asked: Namespace) -> Iterator[Row]:
     there = kept(asked.kept, code) if asked.kept else {}
     left = [site for site in sites if not all(run.key in there for run in site)]
     results = [before(run) | there[run.key] for site in sites if site not in left for run in site]
-    made_by = json.dumps(_head(code))
+    made_by = json.dumps(with_data(code))
     for some, new in everywhere(left, folder() / "integrity", made_by, asked.jobs, begin + 60 * asked.minutes):
         results += some
         if asked.kept and some and not any(result["outcome"] == "failed" for result in some):
@@ -226,8 +226,9 @@ def rows(asked: Namespace) -> Iterator[Row]:
 
 
 def code_of_runs() -> str:
-    """Return the hash of the code that results depend on."""
-    return f"{fingerprint()}-{fingerprint('bench/integrity', 'bench/tracking/worlds.py')}"
+    """Return the hash of the code that results depend on, without that of the tables."""
+    parts = (f"bench/integrity/{name}.py" for name in ("run", "plan", "sites", "kinds", "made_up", "surveys"))
+    return f"{fingerprint()}-{fingerprint(*parts, 'bench/tracking/worlds.py')}"
 
 
 _FOUND = (
@@ -247,7 +248,7 @@ def kept(file: Path, code: str) -> dict[str, Result]:
     if not file.is_file():
         return {}
     with lzma.open(file, "rt") as lines:
-        if (head := json.loads(next(lines))) != (ours := _head(code)):
+        if (head := json.loads(next(lines))) != (ours := with_data(code)):
             raise InputError(f"--kept {file}: of {head}, not {ours}: name another file, or remove it")
         return {result["key"]: result for result in map(json.loads, lines)}
 
@@ -256,12 +257,13 @@ def keep(file: Path, code: str, results: Iterable[Result]) -> None:
     """Add results to a file."""
     with locked(file.with_name(f"{file.name}.lock")):
         new = ({name: result[name] for name in _FOUND if name in result} for result in results)
-        lines = [_head(code), *(kept(file, code) | {result["key"]: result for result in new}).values()]
+        lines = [with_data(code), *(kept(file, code) | {result["key"]: result for result in new}).values()]
         with atomic_path(file) as part, lzma.open(part, "wt") as out:
             out.writelines(json.dumps(line, separators=(",", ":")) + "\n" for line in lines)
 
 
-def _head(code: str) -> dict[str, object]:
+def with_data(code: str) -> dict[str, object]:
+    """Name the code and the real data that results depend on."""
     real = (*files(), *sorted(data().glob("*/base.laz")), *sorted(data().glob("*/truth.tum")))
     return {"code": code, "bytes": {str(file.relative_to(data())): file.stat().st_size for file in real}}
 

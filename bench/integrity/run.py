@@ -22,7 +22,7 @@ from bench.integrity.sites import beside_border, lane, rebuilt, shifted
 from coview_stream import BaseMap, Localizer
 from coview_stream.clouds.trajectory import read_tum
 from coview_stream.config import LocalizerConfig
-from coview_stream.errors import CloudError, RunError
+from coview_stream.errors import CloudError, InputError, RunError
 from coview_stream.geometry.arrays import Floats
 from coview_stream.geometry.transforms import Points, Pose, exp_so3, inverse, pose_from, rotation_angle
 from coview_stream.localization.registration.clouds import LocalMaps
@@ -265,6 +265,8 @@ def on_site(
         try:
             drive = drive_of(run)
             return {"outcome": "no way", "reason": "no such street"} if drive is None else first_fix(robot, drive)
+        except InputError as error:  # no second square of a small survey is far enough from the first
+            return {"outcome": "no way", "reason": str(error)}
         except Exception as error:  # the other runs go on
             return _failed(error)
 

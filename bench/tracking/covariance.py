@@ -103,7 +103,8 @@ def real(run: RealSet) -> dict[str, Any]:
         known = track.tracking
         return figures(errors(track, truth).twist[known], track.covariances[known])
 
-    spec = {"code": fingerprint(), "bench": fingerprint("bench/tracking/covariance.py", "bench/accuracy/scores.py")}
+    parts = "tracking/covariance", "tracking/tracking", "accuracy/scores"
+    spec = {"code": fingerprint(), "bench": fingerprint(*(f"bench/{part}.py" for part in parts))}
     return remembered(below / f"{run.name}-figures.json", spec | {"bytes": run.survey.stat().st_size}, work)
 
 

@@ -44,7 +44,7 @@ def rows(asked: Namespace) -> Iterator[Row]:
         drives = [details for details in found if "tracked_m" in details]
         every += drives
         yield counted(f"{name}, {about}", drives)
-    yield counted("all", every)
+    yield counted("all, false from 1 m, on surveys from 3 m", every)
 
 
 def counted(name: str, drives: Sequence[dict[str, Any]]) -> Row:

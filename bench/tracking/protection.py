@@ -204,7 +204,8 @@ def rows(asked: Namespace) -> Iterator[Row]:
             f"{hits} of {of}: below {100 * high:.2f} %",
             True if high <= RISK else False if low > RISK else None,
         )
-        yield judged(f"protection/error > level, {unit}", text, f"<= {100 * RISK:g} %", holds, hits / max(of, 1))
+        target = "" if holds is None else f"<= {100 * RISK:g} %"
+        yield judged(f"protection/error > level, {unit}", text, target, holds, hits / max(of, 1))
     count = sum(drive["misleading"] for drive in drives)
     yield judged("protection/hazardously misleading", str(count), "0", not count, count)
     yield exposed("protection", "hazardously misleading", count, drives)

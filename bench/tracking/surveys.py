@@ -88,6 +88,7 @@ def measure(run: Run) -> dict[str, Any] | None:
     spec = {
         "code": fingerprint(),
         "bench": fingerprint("bench/integrity", "bench/accuracy/scores.py", "bench/tracking/surveys.py"),
+        "bytes": {file.name: file.stat().st_size for file in surveys.files()},
     }
     found = remembered(folder() / "surveys" / f"{run.seed}-{run.number}.json", spec, work)
     return found if found["name"] else None

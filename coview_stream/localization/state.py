@@ -37,7 +37,7 @@ class Event(StrEnum):
     PLACE_PROPOSED = "the search finds a place that is not alone or not certain"
     PLACE_ACCEPTED = "the search accepts a place"
     MATCH_VERIFIED = "a registration speaks for the place"
-    MATCH_REJECTED = "a registration makes the place too improbable, or contradicts odometry or gravity"
+    MATCH_REJECTED = "a registration makes the place or its pose doubtful"
     VERIFICATION_REQUIRED = "the robot may have been moved unseen"
     PLACE_GIVEN_UP = "too much has spoken against the place, or for too long"
     SCANS_CONTRADICT = "scans do not fit together where odometry puts them"

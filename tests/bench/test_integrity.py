@@ -133,7 +133,7 @@ def test_the_plan_has_the_runs_that_the_bounds_need_and_fitted_kinds_are_not_rep
     assert len(runs) == len({run.key for run in runs}) == 1080
     assert len({(run.kind, run.seed, run.drive_seed, run.driven) for run in runs}) == 1080
     assert min(classes.count("ordinary"), classes.count("outside")) >= 300
-    assert classes.count("near copies") >= 380
+    assert classes.count("near copies") >= 380  # with those of the surveys: below
     real = every("surveys", 30)
     recorded = real_runs(["a", "b"])
     assert {run.family for run in (*runs, *real, *every("calibration"), *recorded[0])} == set(FAMILIES)
@@ -152,6 +152,7 @@ def test_half_of_the_3000_runs_are_on_real_surveys_and_900_near_copies_and_900_o
     assert sum(run.group == "surveys" for run in runs) == RUNS / 2
     classes = [FAMILIES[run.family] for run in runs]
     assert min(classes.count("near copies"), classes.count("outside")) >= 900
+    assert all(upper(0, classes.count(name)) <= most for name, most in integrity.MOST.items() if name in classes)
     assert upper(0, sum(not run.family.endswith("shifted") for run in runs)) < 1e-3
 
 
