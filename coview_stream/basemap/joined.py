@@ -117,7 +117,7 @@ def join_maps(maps: Mapping[str, BaseMap]) -> BaseMap:
         )
 
     def moved_tiles(name: str, edge: float, order: slice = slice(None)) -> Ints:
-        """Move tiles, whose first two columns are counted east and north, or north and east."""
+        """Shift each map's tile numbers; columns 0, 1 count east, north or, with ``order`` reversed, north, east."""
         rows = [np.array(m.arrays[name]) for m in several]
         for tiles, move in zip(rows, moves, strict=True):
             tiles[:, :2] += np.rint(move[:2] / edge).astype(np.int32)[order]

@@ -132,7 +132,7 @@ def summary(base_map: SummarizedMap) -> MapSummary:
 
 
 def too_thin(density: float, voxel: float) -> str | None:
-    """Return a warning if fewer points per m2 were kept than 8 random ones would leave (``voxel``: edge, metres)."""
+    """Return a warning if fewer points per m2 were kept than voxels (edge ``voxel``, metres) keep of 8 random ones."""
     area = voxel**2
     if density >= (1.0 - math.exp(-_THIN * area)) / area:  # share of the squares that are hit
         return None

@@ -30,7 +30,7 @@ class Interrupt:
         self.seen = False
 
     def __call__(self, number: int, frame: FrameType | None) -> None:
-        """Raise, but after the import of a native module; at later alarms only if the exception is not on its way."""
+        """Raise KeyboardInterrupt, but never while a native module is imported; an alarm repeats it if dropped."""
         self.seen = True
         importing = _imports_native(frame)
         signal.setitimer(signal.ITIMER_REAL, _SOON if importing else _AGAIN, _AGAIN)

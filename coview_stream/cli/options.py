@@ -69,9 +69,9 @@ def fill_from_settings(
     args: argparse.Namespace, settings: Mapping[str, Any], path: Path | str, parser: argparse.ArgumentParser,
     tables: Collection[str],
 ) -> dict[str, dict[str, Any]]:  # fmt: skip
-    """Set the options that were not given from some settings, by name, and return the settings' tables.
+    """Set the options that the command line does not give from ``settings``, by name, and return the tables in these.
 
-    ``args.in_file`` gets the options in the settings, ``args.from_file`` those that they decide, with all their names.
+    ``args.in_file`` gets the options in the settings, ``args.from_file`` those set from them, by key and destination.
     ``path`` names the settings in errors.
 
     Raises:
@@ -90,7 +90,7 @@ def fill_from_settings(
         value = getattr(args, action.dest)
         if not (value is None or value is False or value == []):  # 0 is a value
             given.add(action)
-    for group in parser._mutually_exclusive_groups:  # one of a group on the command line replaces the file's others
+    for group in parser._mutually_exclusive_groups:  # a given option excludes the others of its group
         if given.intersection(group._group_actions):
             given.update(group._group_actions)
     file_tables: dict[str, dict[str, Any]] = {}
@@ -114,7 +114,7 @@ def fill_from_settings(
 
 @contextlib.contextmanager
 def blaming_file(args: argparse.Namespace) -> Iterator[None]:
-    """Make an error about an option that ``--config`` has set name the file and the key."""
+    """Name the file and the key in an error about an option that ``--config`` has set."""
     try:
         yield
     except CoViewError as error:

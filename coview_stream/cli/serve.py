@@ -278,7 +278,7 @@ def serve_options(args: argparse.Namespace, tables: dict[str, dict[str, Any]]) -
         mount=mount_of(args) or node.mount,
     )
     localizer = replace(localizer, mount_drawn=localizer.mount_drawn and node.mount.drawn)
-    if "max_gap" not in tables["node"]:  # a pause that keeps the pose must keep its frames too
+    if "max_gap" not in tables["node"]:  # a pause of odometry too short to lose the pose must not lose frames
         node = replace(node, max_gap=max(node.max_gap, node.odometry_timeout))
     table = {"max_speed": node.max_speed} | tables["lidar_odometry"]
     odometry = with_table(LidarOdometryConfig(), table, f"{source}: [lidar_odometry]")

@@ -78,7 +78,7 @@ def decode(path: Path, builder: CloudBuilder) -> None:
 def system_of(path: Path, header: Any) -> tuple[str | None, SurveyUnit | None]:
     """Return the reference system in a header, WKT or ``EPSG:code``, None if it states none, and the unit.
 
-    The system of a file in feet is returned in metres, with its unit; None is the metre.
+    For a file in feet the system returned is in metres, and the unit is the file's; a unit of None is the metre.
 
     Raises:
         CloudError: the system allows no map (degrees, or lengths that differ from lengths on the ground).

@@ -39,7 +39,7 @@ _COMMON_ROW = 840  # values, a multiple of each number of columns, so that the s
 # tested with 3 to 8 columns on frames of three scanners (tests/clouds/test_rows.py)
 _JUDGED, _MIN_JUDGED = 100_000, 3000  # values
 _BINS = 64
-_ALIKE = 0.9  # of the best information: multiples of the right number do no better
+_ALIKE = 0.9  # share of the most information: the least number above it is taken, as multiples do as well
 _CLEARLY, _LEAST = 1.4, 0.02  # factor and nats by which another number has to beat the expected one
 _CHUNK = 1_000_000  # rows
 

@@ -23,7 +23,7 @@ def require(ok: bool, config: object, name: str, allowed: str) -> None:
 
 
 def names_parts(kind: type[Config]) -> type[Config]:
-    """Let a configuration of configurations refuse a field that one of these has, and name its place (ConfigError)."""
+    """Make a configuration refuse an unknown field; the ConfigError names the part that has it, or a similar field."""
     made = kind.__init__
 
     @functools.wraps(made)

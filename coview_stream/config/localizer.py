@@ -63,7 +63,7 @@ class RegistrationConfig:
         track: likewise while tracking.
         iterations: limit per scale.
         source_voxel: metres; one point of the scan is kept per cube of this size.
-        source_points: limit on their number; the choice is random.
+        source_points: limit on the number of these points; the choice is random.
         source_range: metres from the sensor within which the scan's points are used.
         inflation: factor on the inverse Hessian's sigma, which is optimistic, as neighbouring points are not
             independent.
@@ -239,8 +239,8 @@ class LocalizerConfig:
             sensor's own clouds, whose frame leans with the sensor.
         cloud_delay: seconds by which clouds are stamped later than odometry, from -1 to 1, if known; start of its
             estimate. Negative where odometry is late.
-        mount_drawn: heading and place of the lidar on the body are taken from a drawing; False if guessed
-            (:attr:`coview_stream.config.mount.Mount.drawn`): estimated, and in covariances until motion shows them.
+        mount_drawn: heading and place of the lidar on the body are taken from a drawing; False: they are guesses (see
+            :attr:`coview_stream.config.mount.Mount.drawn`), which widen covariances until motion has shown them.
     """
 
     keyframe: KeyframeConfig = field(default_factory=KeyframeConfig)

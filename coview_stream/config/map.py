@@ -65,9 +65,9 @@ class MapConfig:
         voxel: metres; one point is stored per cube of this size.
         tile: metres, size of the tiles by which points are sorted.
         outlier_neighbours: of each point, for the statistical outlier filter; 0 switches it off.
-        outlier_std_ratio: standard deviations of their mean distance beyond which a point is removed.
+        outlier_std_ratio: standard deviations by which a point's mean distance to its neighbours may exceed the mean.
         normal_radius: metres within which neighbours define a point's normal.
-        normal_neighbours: limit on their number.
+        normal_neighbours: limit on the number of these neighbours.
         levels: also put a station on every floor of a building above the ground.
         learned: also store the features for learned re-localization.
     """

@@ -20,12 +20,12 @@ EYE = 1.7
 """Height of the sensor above the ground in metres, if unknown."""
 
 LOWEST_EYE = 0.3
-"""Least height of a sensor above ground, metres: points less far below it stand on walls, down a slope or behind it."""
+"""Least height of a sensor above ground, metres: points less far below it are not taken for ground, but for walls."""
 
 FLOOR_RADIUS = 15.0
 """Metres around a body within which its lidar sees ground: a VLP-16 at a height of 2 m does from 7.5 m on."""
 
-_FREE = 1.3  # metres above a body's origin on the ground: free above ground, even below trees, but part of a wall
+_FREE = 1.3  # metres above a body's origin up to which space is free over ground, even below trees, but not at a wall
 
 
 def channel(name: Channel, grid: PolarGrid) -> Descriptor:

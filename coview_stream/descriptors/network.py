@@ -276,7 +276,7 @@ def weights_name(view: str) -> str:
 
 
 def weights_id(path: Path) -> str:
-    """Return the sha256 of a weight file, or of its original if the card says that it is another form of that.
+    """Return the sha256 of a weight file or, if the file was converted, of the original that the card names.
 
     Maps store it, so that features of weights in another form count as the same.
     """

@@ -75,9 +75,9 @@ class _Ground:
     """Ground below the lidar, over several frames."""
 
     axis: int  # index into AXES of the cloud's axis that points up; 0 is z
-    up: Floats  # (3,) mean normal in the cloud's axes
-    up_level: Floats  # (3,) mean normal after levelling by odometry: (0, 0, 1) without a lean
-    # median angle of the frames' normals from their mean, radians, the smaller of those in level and odometry axes
+    up: Floats  # (3,) median normal in the cloud's axes
+    up_level: Floats  # (3,) median normal in level axes, x along the body's heading: (0, 0, 1) without a lean
+    # median angle of the frames' normals from their median, radians: in level or in odometry's axes, the smaller one
     sway: float
     height: float  # of the sensor above the ground, metres, median
     lean: float  # angle between the ground's normal and odometry's vertical, radians
@@ -237,7 +237,7 @@ def _of_fixed_frames(frames: Sequence[SeenFrame]) -> Iterator[tuple[Reading, lis
     at, seen = poses[:, :2, 3] @ [1.0, 1.0j], middles[:, :2] @ [1.0, 1.0j]
     turned = np.vdot(at - at.mean(), seen - seen.mean())
     moved = float(np.vdot(at - at.mean(), at - at.mean()).real)
-    # it moves as far as the robot does; the middle of one repeated scan does not move
+    # in such a frame the middle moves about as far as the robot; that of one repeated scan does not move
     if float(np.abs(at - at.mean()).max()) < _FAR or abs(turned) < 0.5 * moved:
         return
     low = float(np.median([np.quantile(frame.points[:, 2], 0.1) for frame in frames]))

@@ -112,7 +112,7 @@ def run_findings(
     if len(run) > 1 and wrong in ([], ["motion"]):
         sensors = list(sensor_findings(run, None if wrong else base_map, config, progress))
     lies = any(finding.verdict == "FAIL" for finding in sensors)
-    yield from (finding for finding in found if not (lies and finding.what == "motion"))  # named better below
+    yield from (finding for finding in found if not (lies and finding.what == "motion"))  # ``sensors`` name the cause
     if lies or not wrong:
         yield from sensors
     if base_map is not None and not wrong and not lies:
@@ -232,13 +232,13 @@ def sensor_findings(
 ) -> Iterator[Finding]:
     """Compare clouds, odometry and, with a map, registrations over the run.
 
-    Yields the fault that is more probable than none at some frame (poses are withheld long before), of several the one
-    that most of the accusing frames name; otherwise the calibration at the end. Both are as while tracking.
+    Yields a FAIL if at some frame a fault was more probable than none (poses are withheld long before), and names the
+    cause that most frames gave; otherwise yields an ok, and the calibration at the end, estimated as while tracking.
     """
     try:
         judge, outcome = _judge(base_map, config)
     except ImportError:
-        return  # the motion is not compared either, which is already reported
+        return  # a library is missing: the finding about motion has reported it
     stride = max(1, int(_BETWEEN / max(float(np.median(np.diff(run.stamps))), 1e-6)))
     stride -= stride % 2 == 0  # odd, as two drivers may alternate
     indices = range(0, len(run), stride)[:_WATCHED]
@@ -268,7 +268,7 @@ def sensor_findings(
 
 
 def _judge(base_map: BaseMap | None, config: LocalizerConfig) -> tuple[Judge, Callable[[], tuple[str, Calibration]]]:
-    """Return functions: cause, reason and probability of a frame's fault; words for the compared, and calibration."""
+    """Return functions for a frame's fault (cause, reason, probability) and for the compared inputs and calibration."""
     from coview_stream.localization.frame import FramePreparation
     from coview_stream.localization.localizer import Localizer
     from coview_stream.localization.tracking.monitor import FAULTS

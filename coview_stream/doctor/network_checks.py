@@ -263,9 +263,9 @@ def listen(
 
 
 def robots_findings(heard: Heard, sha256: str | None = None, mount: Mount | None = None) -> Iterator[Finding]:
-    """Judge each robot, its clouds as a node with ``mount`` takes them; without robots, list those that send.
+    """Judge each robot, with its clouds moved by ``mount`` as in a node; without robots, list those that send.
 
-    ``sha256`` is of the map to check, if any.
+    ``sha256`` is the hash of the map that the robots' node should serve; None: any map.
     """
     for capture in heard.captures:
         k = capture.keys

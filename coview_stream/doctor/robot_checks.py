@@ -28,7 +28,7 @@ _NODE = NodeConfig()
 # limits for usual robots
 _MIN_CLOUD_RATE, _MAX_CLOUD_RATE = 2.0, 30.0  # Hz; at 2 Hz and 5 m/s frames are 2.5 m apart
 _MIN_ODOMETRY_RATE = 5.0  # Hz; poses are published at 10 Hz, each with the newest odometry
-_MIN_PER_CLOUD = 0.9  # odometry samples per cloud, less the difference between the two counts
+_MIN_PER_CLOUD = 0.9  # least odometry rate per cloud rate: one sample per cloud, with a margin
 _MIN_POINTS = 1000
 _MIN_DISTANCE, _MAX_DISTANCE = 0.3, 300.0  # metres; the median range of a lidar lies between, anywhere
 _NO_TILT = 1e-9  # radians
@@ -208,7 +208,7 @@ _MAX_STATUS_AGE = 5.0  # seconds; a node publishes one per second
 _LEAP_SECONDS = {37: "TAI (of PTP) against UTC", 18: "GPS time against UTC", 19: "TAI against GPS time"}
 _LEAP_TOLERANCE = 0.4  # seconds from a whole number of leap seconds
 _MAX_FRAMES = 60  # frames compared with odometry
-_NEAREST_NS = 100_000_000  # between the stamps of a cloud and its odometry
+_NEAREST_NS = 100_000_000  # largest difference between the stamps of a cloud and its odometry
 _LONG_SEARCH = 60.0  # seconds: most robots are found within ten
 _DROP_COUNTERS = ("out_of_order", "duplicate", "no_odometry", "late")
 

@@ -45,7 +45,7 @@ _FLAT = 0.5  # least planarity of a surface from which distances are measured
 
 @dataclass(frozen=True, eq=False)
 class Submap:
-    """A keyframe and the points around it, relative to the body, with the map's axes by the poses of ``locate``."""
+    """A keyframe and the points around it: origin at the body, axes of the map according to ``locate``'s pose."""
 
     run: int  # number of the run, from 0
     index: int  # of the keyframe among the run's frames with a pose
@@ -57,7 +57,7 @@ class Submap:
 
     @property
     def T_submap_body(self) -> Pose:
-        """Rotation (4, 4) of the body."""
+        """Pose (4, 4) of the body in the submap: its rotation in the map, without translation."""
         return pose_from(self.T_map_body[:3, :3], np.zeros(3))
 
     @cached_property
@@ -131,7 +131,7 @@ class Registrar:
     def to_map(self, k: int) -> Constraint | None:
         """Register submap ``k`` to the base map from the pose of ``locate``; None if the inlier share is too small.
 
-        If both poses agree, the constraint takes the pose of ``locate``, which includes all earlier registrations.
+        If the result agrees with the pose of ``locate``, that pose is taken: it includes all earlier registrations.
         """
         T_located = self.submaps[k].T_map_body
         target = self._maps.around(T_located[:3, 3])

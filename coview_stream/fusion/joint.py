@@ -153,7 +153,7 @@ def adjust(
 def _odometry(submaps: Sequence[Submap], on_map: Sequence[Constraint]) -> list[Constraint]:
     """Return odometry's steps, with the drift estimated from the run's registrations to the map.
 
-    If an end has no registration, the step of ``locate`` is used unless it jumps there.
+    If an end of a step is not registered, the step of ``locate`` is used, unless it disagrees with odometry.
     """
     config = LocalizerConfig().tracking
     registered = {constraint.source: constraint for constraint in on_map}

@@ -311,7 +311,7 @@ class _Mounted:
 def _mounted(path: Path, survey: _Survey, given: Mount | None, explicit: Path | None = None) -> _Mounted:
     """Return how clouds get into the body frame: as ``given``, else from the recording's frames.
 
-    ``explicit`` odometry may be that of any frame.
+    Odometry from the file ``explicit`` may be of any frame: a mount in the recording is then noted, not applied.
     """
     lidar, tree = survey.lidar, survey.tree
     body = survey.body or tree.body()

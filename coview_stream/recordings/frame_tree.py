@@ -33,7 +33,7 @@ def read_transforms(payload: bytes) -> Iterator[tuple[int, str, str, Pose]]:
 
 
 class FrameTree:
-    """Tree of a recording's frames; ``lidar`` is that of the clouds: only moving transforms above it are kept."""
+    """Tree of a recording's frames; ``lidar`` is the clouds' frame: samples are kept where they may lie above it."""
 
     def __init__(self) -> None:
         self.lidar = ""
@@ -52,7 +52,7 @@ class FrameTree:
             if np.abs(T - before[1]).max() > _SAME:
                 self._moved.add(child)
             above = self.above(self.lidar)
-            if child in above or self.above(child)[-1] != above[-1]:  # a static one may join them later
+            if child in above or self.above(child)[-1] != above[-1]:  # a static transform may join the two trees later
                 self._samples.setdefault(child, []).append((stamp_ns, T))
 
     def body(self) -> str:
@@ -79,7 +79,7 @@ class FrameTree:
     def odometry(self) -> tuple[str, str, list[tuple[int, Pose]]] | None:
         """Return odometry's frame, the body's, and stamps (ns) with T_odom_body (4, 4); None without odometry.
 
-        It is the highest transform above the lidar that moves, or is named odometry, but not one in the map.
+        The highest transform above the lidar counts that moves or starts at ``odom``; a map's if there is no other.
         """
         moving = [
             child for child in self.above(self.lidar)[:-1]

@@ -49,8 +49,8 @@ def open_run(
         odometry_topic: topic of the odometry, if a recording has several with Odometry.
         lidar: used for ``"kiss-icp"`` instead of a ``LidarOdometry()``.
         progress: called with (frames done, frames) during ``"kiss-icp"``.
-        mount: pose of the lidar; clouds are read into the body frame, the frame of the odometry. None: the body itself,
-            or for a recording that in its /tf_static.
+        mount: pose of the lidar; clouds are read into the body frame, the frame of the odometry. None: the lidar is
+            the body; for a recording the pose is read from its /tf_static.
 
     Raises:
         RunError: no frames, no odometry, or odometry that does not match; the message names file and line.

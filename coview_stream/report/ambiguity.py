@@ -112,7 +112,7 @@ def _worst(result: Ambiguity, slow: Bools) -> Floats:
 
 
 def _percents(until: Sequence[float]) -> list[str]:
-    """Format cumulative shares as percentages of the parts that add up; "0 %" means none."""
+    """Format the parts between cumulative shares as percentages that add up; only an empty part gets "0 %"."""
     parts = zip(np.diff(until, prepend=0.0), np.diff(np.rint(100.0 * np.array(until)), prepend=0.0), strict=True)
     limits = {0.0: "under 1 %", 100.0: "over 99 %"}
     return [limits.get(part, f"{part:.0f} %") if 0.0 < share < 1.0 else f"{part:.0f} %" for share, part in parts]

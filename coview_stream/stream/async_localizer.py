@@ -115,9 +115,9 @@ class AsyncLocalizer(SavedState):
             The fix at this frame: see :meth:`fix`.
 
         Raises:
-            CloudError, RunError: as ``Localizer.step``; nothing changes. CoViewError: a process died or failed at an
-                earlier frame; it is restarted, and the place is searched for. Raised once per failure (of several since
-                the last call, only the first is reported); this frame is accepted, continue.
+            CloudError, RunError: as ``Localizer.step``; nothing changes. CoViewError: a process died, which is then
+                restarted, or failed at an earlier frame; if it was the tracking process, the place is searched for
+                again. Only the first failure since the last call is raised. This frame has been accepted: continue.
         """
         self._check_usable()
         self._mailbox.add_frame(cloud, T_odom_body, stamp)
@@ -131,7 +131,7 @@ class AsyncLocalizer(SavedState):
 
         The pose is the newest fix of the tracking process, carried on by odometry: covariance and protection level grow
         with odometry drift since then. ``fix.evidence.stamp`` is the stamp of the newest registration. There is no
-        pose (DOUBTED) if no frame of the last 5 s has been processed.
+        pose (DOUBTED) if no frame of the last 5 s has been processed, or while a frame contradicts the place.
 
         Raises:
             CoViewError: as for :meth:`step`.
@@ -247,7 +247,7 @@ class Mailbox:
         self.changed = threading.Condition()
         self._epoch = 0
         self._error: str | None = None  # not raised yet
-        self._search_told = False  # whether a restart of its engine has reported the failure of the running search
+        self._search_told = False  # whether the restart of its engine has told of the running search's failure
         self.begin(keep_calibration=False)
 
     # ---- the agent's side
@@ -264,7 +264,7 @@ class Mailbox:
                 self.calibration = self.earlier = None
                 self._steps = StepCheck()
             self._newest: _Frame | None = None
-            self._lost: KeyframeEvidence | None = None  # set when the engine was restarted, until it tracks
+            self._lost: KeyframeEvidence | None = None  # why the place was lost; None once a fix has a pose again
             self._forget_fix()
 
     def _forget_fix(self) -> None:

@@ -48,7 +48,7 @@ class Recipe:
     wind: Annotated[Range, 0.0, 1.0] = (0.0, 0.3)  # shift of each crown between the two times, metres, 1 sigma
     # probability that an airborne pulse passes a surface of leaves
     aerial_porosity: Annotated[Range, 0.0, 0.95] = (0.2, 0.7)
-    ground_porosity: Annotated[Range, 0.0, 0.95] = (0.1, 0.6)  # probability that a robot's beam does
+    ground_porosity: Annotated[Range, 0.0, 0.95] = (0.1, 0.6)  # probability that a robot's beam passes one
     # mean depth below a crown's hull at which leaves are hit, metres
     leaf_depth: Annotated[Range, 0.0, 2.0] = (0.05, 0.6)
     pulses: Annotated[Range, 1.0, 200.0] = (5.0, 60.0)  # airborne, per square metre
@@ -62,7 +62,7 @@ class Recipe:
     sensors: tuple[str, ...] = ("vlp16", "os64", "mid360", "vlp16-inclined")
     sensor_height: Annotated[Range, 0.3, 5.0] = (0.6, 2.2)  # metres above the ground
     travel: Annotated[Range, 0.0, 60.0] = (3.0, 25.0)  # metres that the robot drives
-    standing: Annotated[float, 0.0, 1.0] = 0.2  # share of submaps with less than 3 m
+    standing: Annotated[float, 0.0, 1.0] = 0.2  # share of submaps of robots that drive less than 3 m
     frame_step: Annotated[Range, 0.1, 5.0] = (0.7, 2.0)  # metres between the frames of a submap
     tilt: Annotated[Range, 0.0, 20.0] = (0.3, 1.5)  # sway of the robot, degrees, 1 sigma
     gravity_error: Annotated[Range, 0.0, 3.0] = (0.0, 0.4)  # error of its odometry's vertical, degrees, 1 sigma

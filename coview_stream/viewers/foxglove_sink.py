@@ -208,8 +208,8 @@ class FoxgloveSink(Sink):
 def record_world(world: Path, out: Path, mount: Mount | None = None) -> int:
     """Write a simulated world as ``out`` (MCAP, Foxglove's schemas), at the run's stamps.
 
-    ``/robots/truth`` has the true poses and each scan in the map's frame; ``/robots/odometry`` starts there and follows
-    odometry. ``mount`` is the lidar's.
+    ``/robots/truth`` has the true poses and each scan in the map's frame; ``/robots/odometry`` starts at the
+    first true pose and follows odometry. ``mount`` is the lidar's pose on the body.
 
     Returns:
         Number of frames.

@@ -161,7 +161,7 @@ def _terminate(pool: ProcessPoolExecutor) -> None:
 
 @contextmanager
 def _deaf_to_interrupts() -> Iterator[None]:
-    """Start processes that ignore Ctrl-C at the terminal; this one ends them, as Ctrl-C reaches it after the block."""
+    """Let processes started in the block ignore Ctrl-C; this process gets it after the block, and ends them."""
     if not hasattr(signal, "pthread_sigmask"):  # Windows
         yield
         return

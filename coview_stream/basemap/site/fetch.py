@@ -153,7 +153,7 @@ class Mirror:
     """Cached copy of a site or of a part, from which maps are opened with or without a network.
 
     Layers are compared with their hashes before they are written, and the manifest with its signature if there is a
-    key. The manifest is written last, so the mirror always holds one whole state, and the last one that was opened.
+    key. The manifest is written last, so the mirror always holds a whole state; it also keeps the one opened last.
 
     Attributes:
         source: source of the site.

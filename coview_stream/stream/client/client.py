@@ -185,11 +185,11 @@ class RobotClient:
             x: in the frame of the map's sources, metres.
             y: likewise.
             yaw: heading, radians, counter-clockwise from the map's x axis; None: any.
-            distance: radius around it that is tried as well, metres, at most 20.
+            distance: radius around x and y in which other places are tried as well, metres, at most 20.
             timeout: seconds.
-            map: where there are several maps, the name of the one whose frame x and y are in.
+            map: name of the map in whose frame x and y are; needed only if the node has several maps.
             within: radius around x and y, metres, at least 50; nothing outside is searched until the place is known.
-                This is trusted, a quarter wider than given, and grows with the distance driven.
+                The search trusts this circle; it adds a quarter to the radius, and more with the distance driven.
 
         Returns:
             The reply; ``taken`` is False if the guess is refused, and ``note`` says why: the place is known, or the

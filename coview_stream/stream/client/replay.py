@@ -33,7 +33,7 @@ class ReplayConfig:
 
     Attributes:
         rate: frames sent per second; None keeps the spacing of the run's stamps.
-        speed: factor on that spacing; 2 sends a run in half its time. Excludes ``rate``.
+        speed: divides that spacing; 2 sends a run in half its time. Excludes ``rate``.
         odometry_rate: odometry samples sent per second, interpolated between frames; None: one per frame.
         clouds_only: send no odometry; the node makes its own.
         loop: repeat for ever; stamps keep increasing, and the robot is back at its start.

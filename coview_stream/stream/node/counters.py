@@ -28,9 +28,9 @@ log = logging.getLogger("coview_stream.node")
 
 @dataclass
 class Counters:
-    """Counts of everything that can happen to a message; each message is counted once, where it ends.
+    """Counts of received messages, of what became of them, and of events; a message has one outcome.
 
-    Each ``received`` cloud ends in one of the next eleven; up to ten more may be under way.
+    Each ``received`` cloud is counted in one of the next eleven fields, except for up to ten that are under way.
     """
 
     received: int = 0  # clouds

@@ -15,7 +15,7 @@ from coview_stream.stream.transport.error_guard import RateLimitedErrors
 
 # seconds
 _MAX_RESTART_PAUSE = 10.0  # before an engine that keeps dying is restarted
-_LIFE = 60.0  # life of an engine after which its death is not one in a row
+_LIFE = 60.0  # an engine that dies after a longer life counts as dead for the first time, not once more in a row
 _STOPPED_INTERVAL = 1.0  # between checks for a stopped engine; the second check kills it
 _ERROR_PAUSE = 0.2  # after an unexpected error
 _IDLE_WAIT = 0.05  # for an engine without work; a job wakes it earlier

@@ -42,7 +42,7 @@ NICE = {"odometry": 2, "track": 4, "search": 10}
 _POLL_INTERVAL = 0.1  # seconds between checks whether the opening was cancelled
 _PARENT_INTERVAL = 2.0  # seconds between an idle child's checks that its parent lives
 _DOUBT = ("doubt", None)  # message sent during a job
-_REST = 3  # such checks: a robot with a search sends a keyframe every few seconds
+_REST = 3  # idle checks of the parent before memory is freed: a robot in search sends a keyframe every few seconds
 
 
 class RejectedError(Exception):
@@ -126,7 +126,7 @@ class EngineProcess:
         trust: requires a signed map; None accepts any.
         child: the first child, already started; None starts one.
         job_timeout: seconds after which a job counts as hung.
-        open_timeout: the same for a start, from its newest step: a kernel compiled, the map opened.
+        open_timeout: seconds without a new step (a kernel compiled, the map opened) after which a start counts as hung.
     """
 
     def __init__(
@@ -353,7 +353,7 @@ def work(
     kernels, later_kernels = engines.KINDS[kind].kernels, engines.KINDS[kind].later_kernels
     compile_once(*kernels, *later_kernels, say=lambda text: pipe.send(("step", text)))
     for name in kernels:
-        if pipe.poll():  # the node waits for its engines, or a robot soon for a search: full priority
+        if pipe.poll():  # the parent has named the map: it waits for this engine, or a robot soon will: full priority
             _set_group_nice(0)
         warm_up(name)
     steps: deque[Callable[[], None]] = deque(partial(warm_up, name) for name in later_kernels)
@@ -396,7 +396,7 @@ def work(
 
 
 def _set_group_nice(nice: int) -> None:
-    """Set the niceness of this session, where Linux groups tasks by session: a process's own counts only in it."""
+    """Set this session's niceness: where Linux schedules by session, a process's own counts only within its session."""
     with contextlib.suppress(OSError):
         Path("/proc/self/autogroup").write_text(str(nice))
 

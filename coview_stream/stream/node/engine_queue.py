@@ -18,7 +18,7 @@ from coview_stream.odometry.buffer import Segment
 from coview_stream.stream.node.counters import Counters, ErrorLog, Latency, last_line
 from coview_stream.stream.node.inputs import OdometryJob, OdometryResult, PairedFrame
 
-# of searches
+# for the order of searches
 _PATIENCE = 1.5  # seconds of waiting after which a keyframe goes before those that have waited less
 _NEW = 8  # searches for which a robot counts as newly lost; most are found within them
 _MAX_SUPPORT = 16  # searches in a row that propose a place: beyond it the map probably has a similar place
@@ -65,7 +65,7 @@ class SearchJob:
 
     @property
     def epoch(self) -> int:
-        """Epoch of the frame job."""
+        """Odometry epoch of the frame job that made the keyframe."""
         return self.request.epoch[0]
 
 
@@ -132,7 +132,7 @@ class PlaceHints:
         self.drop()
 
     def drop(self) -> None:
-        """Drop this pose for good; only a new pose is offered."""
+        """Drop the last place and its calibration for good: no later epoch offers them again."""
         self.T_map_body: Pose | None = None
         self.calibration: Calibration | None = None
         self._pending = False
@@ -156,7 +156,7 @@ class PlaceHints:
         self.guess = None
 
     def begin_epoch(self) -> None:
-        """Offer all again: with its odometry frame the engine forgets everything, but the robot has not moved.
+        """Offer pose and guess again: in a new odometry epoch the engine forgets both, but they may still be right.
 
         A guess loses its circle, as the distance driven is unknown.
         """
@@ -202,7 +202,7 @@ class EngineQueue:
         self.latency = Latency()  # from the arrival of a cloud to its fix
         self.engine_latency = Latency()  # the engine's share of it
         self.longest_wait = 0.0  # longest wait of a frame of this robot, seconds
-        # longest time from a keyframe to the end of its search, seconds; it inherits the wait of one it replaces
+        # longest seconds from a keyframe to the end of its search; a keyframe inherits the wait of one it replaces
         self.longest_search_wait = 0.0
         self.processed_at: float | None = None  # local time of the newest fix
         self._search_epoch: Epoch | None = None
@@ -325,7 +325,7 @@ class EngineQueue:
             return False
         self._frame_under_way = self._doubting = None
         if job.points is not None:
-            # it may not have been applied, so the next frame carries it too; applied twice it changes nothing
+            # the engine may not have applied this result: the next frame carries it again; a second time is harmless
             self._search_result = self._search_result or job.search_result
         return True
 

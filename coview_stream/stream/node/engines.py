@@ -73,7 +73,7 @@ class TrackEngine(Engine):
         self.config = config or LocalizerConfig()
         self._local_maps = LocalMaps(base_map, self.config.registration.source_range)
         self._robots: dict[str, tuple[int, int, Localizer]] = {}  # first epoch, epoch
-        # without its weights: it only lists the contents of requests for the search engine
+        # without network weights: here the index only says what requests for the search engine must contain
         self._index = SearchIndex.of(base_map, self.config, load=False)
 
     def run(self, job: Job) -> FrameResult:
@@ -157,9 +157,9 @@ class SearchEngine(Engine):
         self.rest()
 
     def rest(self) -> None:
-        """Drop crops of the map and pages of its file; the system caches the pages: 1/8 s per gigabyte to map again.
+        """Drop crops of the map and mapped pages of its file, which searches have read; tracked robots need no search.
 
-        Searches have read the whole map, and there are none while robots are tracked.
+        The system still caches the pages: a later search maps them again in 1/8 s per gigabyte.
         """
         self._local_maps.clear()
         for array in self.base_map.arrays.values():

@@ -2,8 +2,8 @@
 
 For each robot every node ranks all live nodes by a hash of both names (rendezvous hashing), and the first one serves
 it: no coordinator, no ranges to configure. When a node goes only its robots move, spread evenly over the others. A
-node is alive if it holds a liveliness token and sends its robots' places to the others once a second: a token
-vanishes with its process, but any session may hold one. Only a robot's statuses prove that a node serves it: a node
+node is alive if it holds a liveliness token, which vanishes with its process, and sends its robots' places to the
+others once a second, as any session may hold a token. Only a robot's statuses prove that a node serves it: a node
 gives a robot up once a higher-ranked node has sent one, and another node takes it when none has come for 3 s. A node
 whose engines have not been ready for 7 s is silent, ranks last, and takes no robots on while there are other nodes.
 """
@@ -57,7 +57,7 @@ def _names(nodes: Collection[str]) -> str:
 class FleetMembers:
     """The live nodes of a fleet: they hold a liveliness token and were heard in the last 30 looks. Pure logic.
 
-    A look that does not show ``node`` itself says nothing: this node is cut off.
+    A look without the token of ``node`` itself is ignored: this node is cut off from the network.
     """
 
     def __init__(self, node: str) -> None:
@@ -74,7 +74,7 @@ class FleetMembers:
 
     @property
     def settled(self) -> bool:
-        """Whether all token holders have been heard or had time to be: until then robots may have another node."""
+        """Whether every token holder was heard, or had time to send: until then another node may serve any robot."""
         return self.looks > _SILENT or self._tokens <= self.alive
 
     def look(self, tokens: Collection[str], heard: Collection[str] = ()) -> bool:
@@ -249,7 +249,7 @@ class Fleet:
                 if name in self._endpoints and not self._endpoints[name].serving:
                     self._places[name] = LastPlace.from_message(plain)
         except (ValueError, TypeError, KeyError, AttributeError, RecursionError, OverflowError) as error:
-            self._errors.report(f"{self.prefix}/places", error)  # a single place: strangers choose their names
+            self._errors.report(f"{self.prefix}/places", error)  # one name for all: strangers choose theirs
 
     def _on_status(self, sample: Sample) -> None:
         robot = sample.key.split("/")[-3]

@@ -54,7 +54,7 @@ class Break(NamedTuple):
     """Interruption of odometry: frames from before and after must not be searched for as one place."""
 
     reason: str  # one clause for people
-    # after a short pause, the first stamp after it: a known place need only be verified
+    # first stamp after a short pause, from which a known place need only be verified; None: the place is searched for
     verify_from_ns: int | None = None
 
 
@@ -100,7 +100,7 @@ class PairedFrame:
 
 
 class FrameSync:
-    """Frames in order of their stamps, until odometry covers them; counts frames that end here."""
+    """Holds frames in order of their stamps until odometry covers them; counts the frames that it drops."""
 
     def __init__(self, config: NodeConfig, odometry: OdometryBuffer, counters: Counters) -> None:
         self.config = config
@@ -172,7 +172,7 @@ class NewestStamp:
             self._stamp_ns, self._later_at = stamp_ns, now
 
     def stands(self, now: float, longest: float) -> str:
-        """Say that messages come, but for ``longest`` seconds none with a later stamp; empty otherwise."""
+        """Return a text if messages arrive, but none with a later stamp for ``longest`` seconds; else an empty one."""
         if self._stamp_ns is None or now - self._later_at <= longest or now - self.came_at > longest:
             return ""
         return f"with no stamp after {self._stamp_ns * 1e-9:.3f} s for {now - self._later_at:.0f} s"
@@ -311,12 +311,12 @@ class Inputs:
 
 
 class LidarInputs(Inputs):
-    """Inputs of a robot that sends only clouds: lidar odometry processes each cloud, and is then paired with it.
+    """Inputs of a robot that sends only clouds: lidar odometry finds a pose for each cloud, which is paired with it.
 
     Frames go to the odometry engine in order of their stamps; one is under way, and at most two wait. An
-    :class:`OdometryBuffer` classifies the stamps (strays, pauses, restarted clocks), without a motion. Whenever lidar
-    odometry restarts, so does the search, as the motion in between is unknown. No earlier job of this robot has had
-    the id ``epoch``.
+    :class:`OdometryBuffer` finds stray stamps, pauses and restarted clocks, from stamps alone. Whenever lidar odometry
+    restarts, so does the search, as the motion in between is unknown. ``epoch`` is the id of the first
+    lidar odometry, which no earlier job of this robot has had.
     """
 
     odometry_source = "kiss-icp"

@@ -39,7 +39,7 @@ _FORMAT = "coview_stream last pose"
 _MAX_BYTES = 65_536  # of a file; ours have about 500
 _MAX_NAME = 60  # characters of a robot's name in its file's name
 _MAX_GUESS_BYTES = 4096
-_SIGMAS = 2.0  # of a pose's covariance: range tried around it
+_SIGMAS = 2.0  # range tried around a suggested pose, in standard deviations of its covariance
 _GUESS_FIELDS = ("x", "y", "yaw", "distance", "angle", "map", "within")
 
 

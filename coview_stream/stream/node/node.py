@@ -55,7 +55,7 @@ class OpenedMap(NamedTuple):
 
 
 OpenMap = Callable[[str, Callable[[], bool]], OpenedMap | None]
-"""Opens the map file again, unless its hash is the given one; the function returns True to give up."""
+"""Opens the map file again; None if its hash is still the given one. The function is polled: True gives up."""
 
 
 class Node:
@@ -241,9 +241,9 @@ class Node:
 class MapReloader:
     """Changes the map of a running node on request, one change at a time, on its own thread.
 
-    Each robot keeps the old map and its poses until the new map has verified its place: meanwhile both get all
-    messages, and the place on the old map is a hypothesis on the new one. A robot without a place changes at once. One
-    that is not found on the new map within a minute changes without a place, and is searched for.
+    Each robot keeps the old map and its poses until the new map has verified its place: meanwhile its sessions on both
+    get all messages, and the place on the old map is a hypothesis on the new one. A robot without a place changes at
+    once. A robot that is not found on the new map within a minute changes without a place, and is searched for.
 
     Attributes:
         last: outcome of the newest change: ``result`` (``none``, ``loading``, ``handing over``, ``changed``,

@@ -41,7 +41,7 @@ class RobotEndpoints:
         self, session: Session, transport: Transport, reporter: Reporter, wake_engines: Callable[[Session], None],
         pose_format: str | None = None, geo: GeoOutput | None = None,
     ) -> None:  # fmt: skip
-        self._sessions: tuple[Session, ...] = (session,)  # the session in force, perhaps one on another map
+        self._sessions: tuple[Session, ...] = (session,)  # in force; during a change, also on the new map
         self._switching = threading.Lock()  # no pose of the old session is published after the switch
         self._transport = transport
         self._reporter = reporter
@@ -63,7 +63,7 @@ class RobotEndpoints:
         self._sessions = (self._sessions[0], session)
 
     def switch_session(self) -> None:
-        """Switch to that session, with the counters and newest pose of the one in force."""
+        """Put the added session in force; it continues the old one's counters and newest pose."""
         with self._switching:
             old, new = self._sessions
             new.continue_from(old)
@@ -192,7 +192,7 @@ class GeoOutput:
         self._sha256, self._references = loaded.sha256, _references(loaded)
 
     def publish(self, pose: PoseMessage, publisher: Publisher) -> None:
-        """Publish a pose if the map has a reference and the pose a place on Earth."""
+        """Publish a pose if the map has a reference system and the pose can be converted to latitude and longitude."""
         geo, position = self.reference(pose.map_sha256, pose.frame_id), pose.T_map_body[:3, 3]
         if geo is None:
             return
@@ -212,7 +212,7 @@ class GeoOutput:
         publisher.put(encode_location(message, self._encoding))
 
     def reference(self, sha256: str, name: str = "") -> GeoReference | None:
-        """Return the reference of a map by its hash, and of several maps by name; None without one."""
+        """Return the reference of a map, by its hash and, if it joins several, a part's name; None without one."""
         with self._lock:
             if sha256 != self._sha256:
                 try:

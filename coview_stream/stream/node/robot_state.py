@@ -78,13 +78,13 @@ class RobotState:
         before, engine_before = self.state, None if self._fix is None else self._fix.state
         reason = fix.evidence.reason if fix.evidence else "evidence gone"
         if Event.PLACE_GIVEN_UP in events and engine_before is not State.LOST:
-            self._lose(reason)  # else a place accepted at this same frame was given up: no second loss
+            self._lose(reason)  # a place accepted and given up at this one frame is no second loss
         self._fix = fix
         self._lost |= fix.state is State.LOST
         self.calibration = fix.calibration or self.calibration
         asked = frame.job.require_verification
         if asked and self._verify_from_ns is not None and stamp_ns >= self._verify_from_ns:
-            self._verify_from_ns = None  # from here on a doubt is the engine's own
+            self._verify_from_ns = None  # this frame has checked the place: any doubt left is the engine's own
         if fix.state is State.TRACKING and self._verify_from_ns is None:
             self._lost = False
             self._counters.fixes += before is not State.TRACKING
@@ -111,7 +111,7 @@ class RobotState:
         self._verify_from_ns = newest_ns + 1
 
     def explain_loss(self, reason: str) -> None:
-        """Replace the reason of a loss, if the place is lost, by why it does not come back."""
+        """If the place is lost, replace the reason of the loss by the reason why the place is not regained."""
         if self.state is State.LOST:
             self._loss_reason = reason
 
@@ -139,7 +139,7 @@ class RobotState:
         return evidence or self._restart_reason or pending or "too little has been seen"
 
     def searched(self) -> str:
-        """Return why a lost place is not found; empty if there was no search since."""
+        """Return why a lost place is not found again; empty if nothing new is known since the loss."""
         fix = self._fix
         if not self._lost or fix is None or fix.state.has_place or fix.evidence is None:
             return ""

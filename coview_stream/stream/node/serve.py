@@ -226,7 +226,7 @@ def start_engines(
     trust = None if options.verify_key is None else Trust(options.verify_key, base_map.identity)
     path = options.map_path
     if base_map.path is not None and base_map.path != path.absolute():
-        # its sources may change before an engine restarts: engines open this very file, whose hash is known
+        # the sources of this working file may change before an engine restarts: engines open this file of known hash
         path, trust = base_map.path, None
     config = replace(options.localizer, sensor_leans=options.lidar is None)
     # where features are optional, the search engine checks whether the network loads: that takes 60 MB

@@ -130,7 +130,7 @@ class Session:
             self._record_state()
 
     def reset(self, forget: bool = True) -> None:
-        """Start over with nothing. ``forget``: at a client's request; earlier places are refused from now on."""
+        """Forget all but the map. ``forget``: a client asked for it; then :meth:`offer` refuses earlier places."""
         with self.lock:
             if forget:
                 self.hints.forget()
@@ -164,8 +164,8 @@ class Session:
     def guess_place(self, guess: PlaceGuess) -> bool:
         """Let the search try a guess; return False, and do nothing, while a place is known.
 
-        InputError: with several maps the guess names none of them; with one it names another; or the map has no ground
-        there.
+        InputError: the guess names none of several maps; it names another map than the single one; or the map has no
+        ground there.
         """
         if self.parts is not None:
             part = self.parts.named(guess.map)

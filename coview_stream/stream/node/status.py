@@ -275,7 +275,7 @@ class ConnectionMonitor:
             for zid in sorted(come):
                 how = "again" if zid in self._missing else f"instead of {', '.join(sorted(self._missing))}"
                 log.info("connected to router %s %s", zid, how)
-            # a router that replaced another may stay when that one returns: then the other is no longer missing
+            # a router that returned is no longer missing; after a replacement none is: the replaced one may return too
             self._missing = self._missing - come if come & self._missing else set()
         elif come:
             log.info("connected to router %s", ", ".join(sorted(come)))

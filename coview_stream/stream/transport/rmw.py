@@ -21,7 +21,7 @@ _GID = 16
 _ATTACHMENT = struct.Struct("<qqB16s")  # sequence, source time in ns, length of the gid, gid
 _QOS = "::,10:,:,:,,"  # empty fields mean rmw_zenoh's defaults: reliable, volatile; keep the last 10
 _NODE_ID = 0  # each of our sessions has one ROS node
-_ROOT = "%"  # a '/' in a name; hence also the root enclave and the root namespace
+_ROOT = "%"  # stands for '/' in a token; alone, it is the root enclave or the root namespace
 
 
 def dds_type(name: str) -> str:

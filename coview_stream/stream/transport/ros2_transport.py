@@ -372,8 +372,8 @@ class Ros2Transport:
     def _broadcast(self, robot: _Robot) -> None:
         """Broadcast map -> odom at the stamp of new odometry; while the place is lost, the last known transform.
 
-        With odometry, not with poses: then a lookup of the body at odometry's stamp does not wait for the next pose.
-        Never at a stamp before the newest, which comes from a late sample or perhaps a restarted clock.
+        It follows odometry, not poses: so a lookup of the body at odometry's stamp need not wait for the next pose.
+        An older stamp than the newest is skipped: it comes from a late sample, or perhaps from a restarted clock.
         """
         publisher, T, frame, stamp_ns = robot.outputs.get("tf"), robot.T_map_odom, robot.odometry_frame, robot.heard_ns
         if publisher is not None and T is not None and frame and stamp_ns is not None and stamp_ns == robot.odometry_ns:

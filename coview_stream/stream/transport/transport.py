@@ -57,7 +57,7 @@ class Transport(Protocol):
         ...
 
     def answer(self, key: str, handler: Callable[[dict[str, str]], dict[str, Any]]) -> Callable[[], None]:
-        """Answer queries on ``key`` with JSON; the handler takes the query's parameters. Its exceptions are replied.
+        """Answer queries on ``key`` with JSON; ``handler`` takes the query's parameters; an exception is replied.
 
         Returns a function that ends the answers; any thread may call it, more than once.
         """
