@@ -22,7 +22,7 @@ def planar_pose(T: Pose) -> Floats:
 
 
 def planar_covariance(covariance: Floats, T: Pose) -> Floats:
-    """Return a covariance (6, 6) over (rx, ry, rz, x, y, z), map axes, as that (3, 3) of motions from a pose."""
+    """Turn a covariance (6, 6) over (rx, ry, rz, x, y, z), map axes, into that (3, 3) of planar motions from ``T``."""
     R = rot_z(-yaw_of(T))
     return np.asarray(R @ covariance[np.ix_([3, 4, 2], [3, 4, 2])] @ R.T)
 

@@ -1,8 +1,8 @@
 """Protection level of a pose: the error in metres and in degrees that is exceeded at most once in a thousand poses.
 
-A covariance gives the usual size of errors. Rare errors exceed its Gaussian: its scale is an estimate, too, right on
-average over many places and too small at some. With an unknown scale a Gaussian becomes a Student-t. So the squared
-error relative to the trace of its covariance is taken as F(h, n) distributed, times a squared factor: h is the
+A covariance gives the usual size of errors. Rare errors are larger than this Gaussian allows, as its scale is itself an
+estimate: right on average over many places, too small at some. A Gaussian of unknown scale is a Student-t. So the
+squared error over the trace of its covariance is taken as a squared factor times an F(h, n) variable: h is the
 effective number of axes of the error (3 for a sphere, 1 for a needle; Satterthwaite's (tr C)^2 / tr C^2), and n, the
 degrees of freedom of the tail, tells how well the scale is known.
 """
@@ -37,9 +37,9 @@ LEVELS = ("m", "deg", "horizontal_m", "vertical_m")
 
 
 class OtherHeights(NamedTuple):
-    """Other heights than the registered one at which the robot may be, where the ground may have been changed.
+    """Heights of the robot other than the registered one, possible where the ground may have been changed.
 
-    They have known probabilities, so no tail is added: the level is widened by their ``reach``.
+    Their probabilities are known, so they need no heavy tail: their ``reach`` is added to the level.
     """
 
     variance: float = 0.0  # metres^2, part of the covariance

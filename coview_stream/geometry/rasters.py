@@ -65,7 +65,7 @@ def by_square(points: Reals, edge: float) -> tuple[Ints, Ints, Ints]:
     Returns:
         order: (N,) indices of the points, square by square.
         squares: (T, 2) column and row: a square covers ``[column, column + 1) * edge`` in x, likewise in y.
-        begin: (T + 1,) start of each square's points in that order, and their number.
+        begin: (T + 1,) index in ``order`` at which the points of each square begin; last, the number of all points.
     """
     cells = np.floor(points[:, :2].astype(np.float64) / edge).astype(np.int64)
     order = np.lexsort((cells[:, 1], cells[:, 0]))

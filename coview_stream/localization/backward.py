@@ -103,7 +103,7 @@ class RecordingLocalizer(Localizer):
         self._slipped |= match.moves_place
         if ruling.believed and not (match.moves_place or self._tracker.risen):
             covariance = match.covariance.copy()
-            # the heights that were possible then
+            # the height's variance by changed ground at this registration
             covariance[5, 5] += self._tracker.change.others.variance + self._tracker.change.alone
             level = self._tracker.protection_level()
             shared = swap_rotation_translation(self._tracker.reported_covariance(mount_and_clock=False))
@@ -121,8 +121,8 @@ def track_backward(
 ) -> None:  # fmt: skip
     """Track from the registered frame ``begin`` back to the frame after ``stop``; store poses and registrations.
 
-    Poses before the earliest registration are kept only at the start of the run (``stop`` is -1): elsewhere tracking
-    ended in doubt or meets live tracking.
+    Poses of frames before the earliest registration are kept only if tracking arrives at the start of the run (``stop``
+    is -1) with a pose: elsewhere it ended in doubt or meets live tracking.
     """
     start = frames[begin]
     assert start.registered is not None

@@ -307,7 +307,7 @@ class Localizer(SavedState):
         points, T_odom_raw = self._frames.validate(cloud, T_odom_body, stamp)
         if self._frames.steps.add(T_odom_raw, stamp):
             self._requests.odometry_jumped(None if self._newest is None else self._newest.T_odom_body)
-            if self.state.has_place and self._newest is not None:  # odometry is right, or the body is where it was
+            if self.state.has_place and self._newest is not None:  # the robot was moved, or is still here
                 here = self._tracker.T_map_odom @ self._newest.T_odom_body
                 self._handle(Event.PLACE_GIVEN_UP)
                 self._requests.hints.robot_at(here)

@@ -144,7 +144,7 @@ class Fix:
         drift: rates of odometry's drift, to propagate this pose; None unless TRACKING.
         protection: metres and degrees that the pose's error, relative to the map, exceeds at most once in a thousand
             poses: see docs/tracking.md; None unless TRACKING.
-        calibration: corrections of the sensor's tilt and of odometry, in any state, from the second keyframe on.
+        calibration: corrections of sensor tilt and odometry, in any state; measured from the second keyframe on.
     """
 
     stamp: float

@@ -38,7 +38,7 @@ class SavedState:
     def save_state(self: _Localizer, path: str | os.PathLike[str]) -> None:
         """Write the pose of the newest frame and the calibration, as JSON, complete or not at all.
 
-        Without a pose, the pose already in the file stays; before the first frame, the whole file. Call it after
+        Without a pose, the pose already in the file stays; before the first frame, the whole file stays. Call it after
         frames, as often as you like, to lose little in a crash or power cut. OSError if the file cannot be written.
         """
         path = Path(path)

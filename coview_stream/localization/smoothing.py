@@ -176,9 +176,9 @@ class _Chain:
                 self.spread[before + 1 : after + 1] += shares[:, None, None] * calibration.motion_covariance(way)
 
     def _break(self, registered: Sequence[int], max_innovation: float) -> None:
-        """Find the breaks up to the last of ``registered``, a live registration.
+        """Find the breaks between the successive registered frames ``registered``.
 
-        The first one is the previous live registration, if any; those between are backward registrations.
+        The last one has a live registration, the first the previous live one, if any; all between have backward ones.
         """
         slipped_back = [self.registered[k].backward and self.registered[k].slipped for k in registered]
         slipped = self.registered[registered[-1]].slipped and not any(slipped_back)

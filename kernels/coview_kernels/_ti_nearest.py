@@ -40,8 +40,8 @@ def cell_of(cells, count) -> ti.i32:
 def walk(frame: ti.template(), starts: ti.template(), rows: ti.template(), x, y, z, limit, margin):
     """Find the nearest point within the square root of ``limit``.
 
-    Returns its squared distance, its row (-1 if there is none), and a lower bound of the squared distance of every
-    other point: of the second nearest, the limit, or of the nearest's distance plus ``margin``.
+    Returns its squared distance, its row (-1 if there is none), and a lower bound of the squared distance of all other
+    points: the least of the second nearest's, ``limit``, and the square of the nearest's distance plus ``margin``.
     """
     size, per_metre = frame[3], frame[4]
     nx, ny, nz = ti.cast(frame[5], ti.i32), ti.cast(frame[6], ti.i32), ti.cast(frame[7], ti.i32)
@@ -49,7 +49,7 @@ def walk(frame: ti.template(), starts: ti.template(), rows: ti.template(), x, y,
     beyond = limit
     found = -1
     ring = 0
-    # by its bits, as a host program may have told the compiler that there are no NaNs
+    # finds NaN and inf by their bits, as a host program may have told the compiler that there are no NaNs
     if ((ti.bit_cast(x + y + z, ti.i64) >> 52) & 0x7FF) == 0x7FF:
         ring = -1
     # offsets from the corner are only for cells; distances must round like the twin's

@@ -121,7 +121,7 @@ def voxel_filter(
 
     ``merge``: -1, or 0 to keep every point. ``settings``: 12 numbers of T, then 1 / voxel or 0, the squares of r_min
     and r_max, a coordinate beyond reach, the sensor's voxel, the origin of ranges. ``totals``: kept, not finite, out of
-    reach, cubes, accumulated over calls. One slot behind the table takes the points that are not kept.
+    reach, cubes, accumulated over calls. One slot behind the table takes the bits written before the first cube.
     """
     ti.loop_config(serialize=True)
     for _ in range(1):

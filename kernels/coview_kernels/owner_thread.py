@@ -68,8 +68,8 @@ class OwnerThread:
     def here(self, fn: Callable[[], R]) -> R:
         """Run ``fn()`` on the caller's thread while no other call runs.
 
-        ``fn`` must be short, and must not use :meth:`call` or :meth:`here`. Nor may a signal handler of the caller,
-        which would wait for the call that it interrupts.
+        ``fn`` must be short, and must not use :meth:`call` or :meth:`here`. A signal handler of the caller must not use
+        them either, as it would wait for the call that it interrupts.
         """
         if threading.current_thread() is self._thread:
             return fn()

@@ -87,8 +87,8 @@ def _transform_unique(
 class _KernelPass:
     """One pass of the kernel over a cloud, with its hash table and results; for native code only.
 
-    Both are kept between calls, and double when they are full. The table is never cleared, as entries carry the number
-    of their call.
+    Both are kept between calls, and double when they are full. The table is cleared only when the call numbers run out,
+    as its entries carry the number of their call.
     """
 
     def __init__(self) -> None:

@@ -137,8 +137,8 @@ class Calibration:
     def motion_covariance(self, step: Floats, turned: float = 0.0, change: Floats | None = None) -> Floats:
         """Covariance (6, 6) over (rx, ry, rz, x, y, z) of odometry's motion between two clouds, in the step's axes.
 
-        ``step`` is (3,) metres, ``turned`` radians about z, ``change`` (3,) that of the body's velocities (x, y,
-        rotation about z) over the motion.
+        ``step`` is (3,) metres, ``turned`` radians about z, ``change`` (3,) the change of the body's velocities (x, y,
+        rotation about z) from the start of the motion to its end.
         """
         along = np.concatenate([np.zeros(3), step])
         across = np.concatenate([np.zeros(3), [-step[1], step[0], 0.0]])
@@ -153,9 +153,9 @@ class Calibration:
     def pose_covariance(self, R_map_body: Floats, rates: Floats) -> Floats:
         """Covariance (6, 6) over (rx, ry, rz, x, y, z), map axes, that mount and clock add to a body pose.
 
-        ``R_map_body`` is (3, 3), ``rates`` (3,) the body's velocities x, y and rotation about z in its axes. A late
-        cloud leaves the robot behind. The stated mount defines the body, and the cloud's stamp the time: so only
-        uncertainty beyond the tolerances of a correct robot counts.
+        ``R_map_body`` is (3, 3), ``rates`` (3,) the body's velocities x, y and rotation about z in its axes. If clouds
+        are late, an uncertain delay shifts the pose along the motion. Only sigmas beyond the tolerances of a correct
+        robot count, as the stated mount defines the body, and the cloud's stamp the time.
         """
         heading = max(0.0, self.sigma_heading**2 - HEADING_TOLERANCE**2)
         lever = max(0.0, self.sigma_lever**2 - LEVER_TOLERANCE**2)
@@ -265,8 +265,8 @@ LEVEL = math.radians(0.5)
 def lean_prior(lean: float, sigma: float) -> float:
     """Return the log-probability of a lean that was fitted, for a sensor with ``sigma`` radians of lean per axis.
 
-    It covers all leans within :data:`LEVEL`, as scans do not tell them apart. A smaller lean counts as none and costs
-    nothing.
+    It is the probability of all leans within :data:`LEVEL` of the fitted one, as scans do not tell them apart. A lean
+    below :data:`LEVEL` counts as none and costs nothing.
     """
     if lean < LEVEL:
         return 0.0

@@ -45,13 +45,13 @@ class SeenMotion(NamedTuple):
 class DelaySearch:
     """Grid search for the delay of the clouds.
 
-    The filter only follows a delay that it nearly knows. Here a motion is compared with odometry at each delay, which
-    finds large delays and also uses the shaking of the body. A motion is judged once odometry extends beyond it by the
-    largest delay.
+    The calibration's Kalman filter only follows a delay that it nearly knows. Here a motion is compared with odometry
+    at each delay, which finds large delays and also uses the shaking of the body. A motion is judged once odometry
+    extends beyond it by the largest delay.
 
-    Where odometry's noise is larger than the robot's changes of speed, each motion favours some delay by chance. So a
-    delay also has to be favoured steadily: a sum of symmetric terms exceeds x times the root of their sum of
-    squares with probability exp(-x^2 / 2) at most.
+    Where odometry's noise is larger than the robot's changes of speed, each motion favours some delay by chance. So the
+    motions also have to favour a delay steadily: by chance, a sum of symmetric terms exceeds x times the root of its
+    sum of squares with probability exp(-x^2 / 2) at most.
 
     Attributes:
         evidence: (D,) log-likelihoods of DELAYS, up to a constant.
@@ -88,7 +88,7 @@ class DelaySearch:
         return judged
 
     def _judge(self, seen: SeenMotion, odometry: OdometryHistory) -> None:
-        """Compare a motion with odometry at each delay, by the noise that interpolation leaves of odometry's."""
+        """Compare a motion with odometry at each delay, by the share of the noise that interpolation leaves there."""
         before, after = odometry.all_at(seen.begin - DELAYS), odometry.all_at(seen.end - DELAYS)
         R = before[:, :3, :3].transpose(0, 2, 1)
         moved = (1.0 + seen.applied.scale) * np.einsum("dij,dj->di", R, after[:, :3, 3] - before[:, :3, 3])
@@ -110,9 +110,9 @@ class DelaySearch:
         self.shaking = np.maximum(shaking - shaking.max(), _STEPS)
 
     def better_than(self, delay: float, sigma: float, surprise: float) -> float | None:
-        """Return the most probable delay, seconds, if it lies beyond the applied ``delay`` with its ``sigma``.
+        """Return the most probable delay, seconds; None if it lies near the applied ``delay``, by its ``sigma``.
 
-        None if it does not, or if it lacks the log-odds of a ``surprise`` that may be anywhere on the grid.
+        None, too, if the evidence does not exceed ``surprise``, the log-odds against a delay anywhere else on the grid.
         """
         gap, best = np.abs(DELAYS - delay), int(self.evidence.argmax())
         near = gap <= max(3.0 * sigma + RESOLUTION, float(gap.min()))

@@ -9,8 +9,8 @@ believed registration to the map gives two measurements:
 * Attitude against odometry's gravity. With u the vertical in the body's axes, by the map and by odometry, the residual
   tilt is u_map x u_odometry (eq. C1). The sensor's tilt turns with the body, the lean of the odometry frame does not;
   the pose graph follows the latter.
-* Motion since the previous registration against odometry's (eq. C2, :func:`motion_jacobian`), except for the errors of
-  both registrations and odometry's random walk.
+* Motion since the previous registration. It differs from odometry's by the systematic errors (eq. C2,
+  :func:`motion_jacobian`), by the errors of both registrations and by odometry's random walk.
 
 A motion far outside this model (slipping wheels) counts less, by Student's t distribution. All components walk randomly
 with the metres driven. While a place only leads a search, the state is a mixture of two Gaussians: the place is right
@@ -117,9 +117,9 @@ def motion_jacobian(step: Pose, rates: Floats, scale: float = 0.0) -> Floats:
 class CalibrationBelief:
     """Gaussian over the state x = (roll, pitch, s, w, g, τ, ψ, l), with heavier tails where measurements contradict it.
 
-    Most sensors are mounted straight and most odometry has the right scale. So the prior of a group is a mixture of a
-    narrow one about zero, or an earlier value, and a wide one; the applied value is the mean of both by their
-    probabilities (Savage-Dickey ratio, eq. C3).
+    Most sensors are mounted straight and most odometry has the right scale. So the prior of a group of components is a
+    mixture of two Gaussians, a narrow one about zero or an earlier value and a wide one. The applied value is the mean
+    under both, weighted by their probabilities (Savage-Dickey ratio, eq. C3).
 
     Attributes:
         x: (10,) mean.
@@ -413,11 +413,11 @@ class CalibrationEstimator:
         self._apply()
 
     def search_delay(self) -> None:
-        """Judge the motions that odometry has passed by a second; call it at each frame.
+        """Judge the motions after which odometry has gone on for a second; call it at each frame.
 
-        The state restarts at another delay if they favour it. The filter learns the delay only here: a rate at the end
-        of the newest motion contains the noise of its last step of odometry, which would look like a delay of half
-        a step. Rates over both sides of a moment do not. Where odometry is late, it learns the rest here, too.
+        If they favour another delay, the state restarts there. The filter learns the delay only here: just after a
+        motion, the rate at its end contains the noise of odometry's last step, which would look like a delay of half a
+        step; later the rate spans both sides of that moment. If odometry is late, the filter learns all else here, too.
         """
         judged = self._delays.judge(self.history)
         for belief in filter(None, (self._known, self._supposed)):
@@ -481,12 +481,12 @@ class CalibrationEstimator:
     def _learn_motion(
         self, motion: Pose, step: Pose, J: Floats, noise: Floats, applied: Calibration, part: Floats | None
     ) -> None:
-        """Add a motion to the components ``part`` of the beliefs; ``applied`` is the calibration of it and ``step``."""
+        """Correct the components ``part`` of the beliefs by a motion; ``applied`` has corrected it and ``step``."""
         turned = log_so3(motion[:3, :3] @ step[:3, :3].T)
         gap = np.append(motion[:2, 3] - step[:2, 3], turned[2])
         H = np.zeros((3, SIZE))
         H[:, _MOTION] = J
-        # clouds levelled by the attitude of another time are bent, which biases their registration as much
+        # clouds levelled by the attitude of another moment are bent: at a lidar's height they are shifted by this much
         bent = np.diag([turned[1], turned[0], 0.0]) * _HEIGHT
         self._update(gap + J @ _motion_part(applied), H, noise + bent**2, part=part)
 

@@ -8,8 +8,8 @@ differs from odometry's (hand-eye calibration, to first order) by
   heading of the sensor on the body (eq. C2).
 * (R - I) ε + w |t| z in rotation: a turning robot also observes its roll (eq. C4).
 
-The registration also corrects the motion itself, as drift of odometry smears the virtual scan of many keyframes. Both
-are weighted by their variances, and a registration that contradicts odometry counts less.
+The registration also corrects the motion itself, as odometry's drift smears the virtual scan of many keyframes. The
+two motions are weighted by their variances, and a registration that contradicts odometry counts less.
 """
 
 from __future__ import annotations

@@ -10,9 +10,9 @@ within some dozen metres. Each view gives two observations:
   of it at another height, like a level site dug by two metres; a copy becomes less probable by the metre.
 * Structure, under both kinds: roofs, crowns and the ends of walls fit the survey only at the right h.
 
-So in a pit whose ramp the survey lacks the height follows odometry, or structure where that shows a height, and returns
-to ground as surveyed. Without evidence all heights stay possible, which the variance shows. Changed ground is left out
-of registration: it would shift the robot in height and look like a lean of the sensor.
+So in a pit with a ramp that is not in the survey, the height follows odometry, or structure where structure shows one;
+beyond the pit it follows surveyed ground again. Without evidence all heights stay possible, which the variance shows.
+Changed ground is left out of registration: it would shift the robot in height and look like a lean of the sensor.
 """
 
 from __future__ import annotations
@@ -125,7 +125,7 @@ class GroundChange:
         if self._scan is None:
             return 0.0
         if self._started:
-            # by the previous attitude, as a leaning odometry frame rises or sinks by itself
+            # compared here, not where the robot was: along a leaning odometry frame the height changes by itself
             before, now = (transform(T, position[None])[0, 2] for T in (self._T_map_source, T_map_source))
             self._h += float(now - before)
             self._walk(driven, variance)
@@ -281,7 +281,7 @@ class _Patches:
         return np.asarray((mean < 0.0)[self._cell])
 
     def _shares(self, heights: Reals) -> tuple[Floats, Floats, Floats]:
-        """Log-likelihoods (K, H) by the share of surveyed patches; densities (H, P) as surveyed and as changed."""
+        """Log-likelihoods (K, H) for each kept share; densities (H, P) of the patches as surveyed and as changed."""
         at = self.height + heights[:, None]
         z = at / self._sigma
         same = (0.9 * np.exp(-0.5 * z**2) + 0.1 / 3.0 * np.exp(-(z**2) / 18.0)) / (self._sigma * math.sqrt(2 * math.pi))

@@ -57,9 +57,9 @@ class GroundOffset:
         self.restore(0.0)
 
     def restore(self, metres: float) -> None:
-        """Restart, now and at every accepted place, with an earlier offset of this site as a third hypothesis.
+        """Restart; from now on, an earlier offset of this site is a third hypothesis at every accepted place.
 
-        It is the most probable one until registrations contradict it; an offset near zero adds none.
+        It is the most probable hypothesis until registrations contradict it. An offset near zero adds no hypothesis.
         """
         self._none, self._some = _NONE * _ZERO, (1.0 - _NONE) * _ANY
         if abs(metres) > 2.0 * _NONE_SIGMA:
@@ -111,7 +111,7 @@ def log_likelihoods(cloud: RegistrationCloud, T_map_source: Pose, target: LocalM
     between = 0.5 * (below - above) / bend if bend < 0.0 else 0.0
     level = float(_SHIFTS[k] + (_SHIFTS[1] - _SHIFTS[0]) * np.clip(between, -1.0, 1.0))
     shares = _patch_shares(structure, _fits(structure, T_map_source, target))
-    # at the structure's height, the ground is off by their difference
+    # shift of the structure under each offset: the offset above the best shift of the ground, before it was lowered
     at = _OFFSETS + level - cloud.ground_offset
     still = _between(shares, at)
     rows = [np.log(_CHANCE + (1.0 - q) * still + q * _between(shares, at - g)).sum(axis=0) for g, q in _GROWTHS]

@@ -46,7 +46,7 @@ class OdometryHistory:
         self._poses.append(T_odom_body)
 
     def at(self, stamp: float) -> Pose:
-        """Return the pose (4, 4), odometry <- body, at a stamp; IndexError before the first pose."""
+        """Return the pose (4, 4), odometry <- body, at a stamp; IndexError if no pose has been added."""
         k = bisect_left(self._stamps, stamp)
         if k < len(self._stamps) and self._stamps[k] == stamp:
             return self._poses[k]
@@ -102,7 +102,7 @@ class OdometryHistory:
     def noise_share(self, begins: Floats, ends: Floats) -> Floats:
         """Return the variances (N,) of motions from ``begins`` to ``ends`` (N,) by odometry's white noise.
 
-        They are in units of the variance over the same time between stamps: interpolation averages the noise of a step.
+        The unit is the variance of an equally long motion from stamp to stamp: interpolation averages a step's noise.
         """
         known = np.array(self._stamps)
         parts = np.diff(np.clip(known[None], begins[:, None], ends[:, None]), axis=1)

@@ -31,8 +31,8 @@ _COVERED = 0.05  # least covered share of a scan by which other shares are divid
 _TAIL = (84.0, 95.0, 99.0)  # percentiles
 _MANY = 20  # least places for which the second largest share is meaningful
 _CALIBRATED = 1.75
-"""Factor on the number of independent observations by scatter. With it, of the searches on maps of other sites less
-than a share e state an error below e (``python -m bench.integrity.calibrate``)."""
+"""Factor on the number of independent observations that the scatter gives. With it, less than a share e of the searches
+on maps of other sites state an error below e (``python -m bench.integrity.calibrate``)."""
 OPEN = 0.01
 """Presumed share of places as clear of structure and as level as the right one: open roads."""
 _RINGS, _SPOKES = (3.0, 5.0, 8.0, 12.0), 8  # metres from the pose, and places on each ring
@@ -75,10 +75,10 @@ class Background:
         return _structure_at(observed, self.structure, self.around)
 
     def relative_errors_at(self, observed: Floats32) -> tuple[Floats, Floats]:
-        """Return the relative standard errors (P, 4) of :meth:`structure_at`, by the poses around and by the places.
+        """Return two relative standard errors (P, 4) of :meth:`structure_at`.
 
-        Chance at a place is estimated from few poses, or from none if they lie outside the survey. Without ``around``
-        both are (1, 4) zeros.
+        The first comes from the scatter among the poses around a place, which are few, or none if they lie outside the
+        survey; the second from the scatter between places. Without ``around`` both are (1, 4) zeros.
         """
         if self.around is None:
             return np.zeros((1, 4)), np.zeros((1, 4))
@@ -98,7 +98,7 @@ def outcomes(observed: Floats32) -> Floats:
 
 
 def observe_around(layers: kernels.FieldMap, part: ScanPart, poses: Floats) -> Floats32:
-    """Return the mean shares (P, 8) of the outcomes at the neighbours of poses (P, 4), and their variances."""
+    """Return (P, 8): means of the four outcomes' shares at the neighbours of poses (P, 4), then their variances."""
     nothing = part.points.structure[:0]
     structure = replace(part, points=replace(part.points, low=nothing, free=nothing))
     neighbours = (poses[:, None] + _NEIGHBOURS).reshape(-1, 4)
@@ -110,18 +110,18 @@ def observe_around(layers: kernels.FieldMap, part: ScanPart, poses: Floats) -> F
 def scatter(observed: Floats32) -> Floats:
     """Return the variances (4,) of chance places' shares (on, near, explained, passed), in units of one point's.
 
-    They are those of the narrowest normal distribution that covers the tail towards the shares of a right place, at
-    one, two and about three standard deviations and at the second largest share. The tail is often wider than the
-    middle, where a few places are of another kind.
+    They are those of the narrowest normal distribution that reaches as far towards the shares of a right place as
+    chance places do, at their 84th, 95th and 99th percentiles and at the second largest share. The tail is often wider
+    than the middle, where a few places are of another kind.
     """
     return _tail_variance(_deviations(observed))
 
 
 def left_in_mean(observed: Floats32) -> Floats:
-    """Return ratios (4,) of the variance of the mean over keyframes to the mean variance (max of bulk and tail).
+    """Return the share (4,) of the variance that the mean over keyframes keeps: of all places or the tail, if more.
 
     ``observed`` (N, W, 7 or 15) has W keyframes at the same chance places. Keyframes share most of their surroundings,
-    so a place that fits by chance continues to fit: a ratio of 1 means that all keyframes see the same.
+    so a place that fits by chance continues to fit: a share of 1 means that all keyframes see the same.
     """
     count, width = observed.shape[:2]
     if count < _MANY or width < 2:

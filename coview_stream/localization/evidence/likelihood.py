@@ -85,8 +85,8 @@ def nuisance_prior(background: Background) -> Floats:
 def ratio_variances(observed: Floats32, background: Background) -> Floats:
     """Return the variances (P,) of log-likelihood ratios by the standard errors of chance at each place.
 
-    They count by the share that unchanged structure explains, at the most probable nuisance values. From place to place
-    outcomes vary together, with the density of the map, so those errors add up; around one place they hardly do.
+    An error counts by the share that unchanged structure explains, at the most probable nuisance values. From place to
+    place all outcomes vary together, with the density of the map, so these errors add up, unlike errors around a place.
     """
     counts = outcomes(observed)
     chance = background.structure_at(observed)[:, None, None]
@@ -153,9 +153,9 @@ def posterior(ratios: Floats, votes: Ints, count: int, starts: int = 1, variance
     ``count`` is the number N of scored places, including these: the others have the likelihood of chance. ``starts`` is
     the number of starts of the search since a place was accepted, ``variances`` (P,) are of the ratios, default none.
 
-    It may be evaluated after every keyframe: where every place is wrong the odds of all places together are a
-    martingale, so they ever exceed 1 / e with probability e at most (Ville's inequality). Each restart of a search is
-    another chance of an error; as the inverse squares are summable, all starts together have less than 2 e.
+    It may be evaluated after every keyframe: where every place is wrong, the odds of all places together are a
+    martingale, so the probability that they ever exceed 1 / e is e at most (Ville's inequality). Each restart is one
+    more chance of an error. The prior falls with the square of ``starts``, so all starts together have less than 2 e.
     """
     ranks = np.minimum(votes, max(count, 1) - 1)
     # two recognizers rank places, and followed places keep their ranks: their sum may exceed that of one list
@@ -172,14 +172,14 @@ def posterior(ratios: Floats, votes: Ints, count: int, starts: int = 1, variance
 
 
 def _mean_gaps(gaps: Floats, sigmas: Floats) -> Floats:
-    """Return log-odds (N,) with the mean probability of uncertain ones: ``gaps`` with normal errors."""
+    """Return the log-odds (N,) of the mean probability under normal errors ``sigmas`` of log-odds ``gaps`` (N,)."""
     uncertain = gaps - sigmas * _NORMAL[:, None]
     wrong = np.logaddexp.reduce(_NORMAL_WEIGHTS[:, None] - np.logaddexp(0.0, uncertain), axis=0)
     return np.asarray(np.where(gaps > 0.0, np.log(-np.expm1(wrong)) - wrong, gaps))
 
 
 def odds_of(gaps: Floats, variances: Floats) -> Floats:
-    """Return the odds (N,) of places against another one that leads by log-ratios (N,) with these variances."""
+    """Return the odds (N,) of places against a leader, whose log-ratio exceeds theirs by uncertain ``gaps`` (N,)."""
     return np.asarray(np.exp(-_mean_gaps(gaps, np.sqrt(variances))))
 
 

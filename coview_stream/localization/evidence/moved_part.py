@@ -102,7 +102,7 @@ def _structure(
 
 
 def _explained(field: kernels.FieldMap, points: Points, structure: Points, shifts: Floats, place: Floats) -> Floats:
-    """Return 1 for points (N, 3) near unexplained map structure at shifts (H, 2) of a place (4,), else 0.
+    """Return (H, N): 1 where a point (N, 3), at a shift (H, 2) of a place (4,), is near unexplained map structure.
 
     ``points`` and the scan's ``structure`` (M, 3) are relative to the place.
     """

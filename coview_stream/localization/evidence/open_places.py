@@ -2,8 +2,8 @@
 
 Ground and free space of a scan agree with the map at the right place and at every open place. The rarity of open places
 determines the value of that agreement (:mod:`coview_stream.localization.evidence.likelihood`): next to nothing on a
-plain, up to ten nats in hills. They are counted twice, and the larger share holds: among a hundred chance places that
-the search has scored, and among poses at random stations of the map, thousands at each keyframe. A place has to stay
+plain, up to ten nats in hills. Open places are counted twice, and the larger share holds: among a hundred chance places
+that the search has scored, and among poses at random stations, thousands at each keyframe. A place has to stay
 open over the whole drive: poses that are open so far are followed from keyframe to keyframe, and new ones are also
 looked up at the earlier keyframes.
 """
@@ -33,7 +33,7 @@ SIGHT = 35.0
 
 @dataclass(frozen=True)
 class _Drives:
-    """Drives from stations at random headings, with odometry's motion."""
+    """Imagined drives with odometry's motion: each was at a random station and heading at one of the keyframes."""
 
     poses: Floats  # (S, 4) at the newest keyframe
     weights: Floats  # (S,) number of drives that each represents
@@ -116,14 +116,14 @@ class OpenPlaces:
     def share(self, chance: Floats32, background: Background, leader: Floats | None = None) -> Floats:
         """Return the probability (Q, L) that a chance place is open, by nuisance values.
 
-        ``chance`` (P, 7) are observations at chance places more than :data:`SIGHT` from the leader (x, y, ...);
-        stations as near to ``leader`` are ignored, too. ``background`` is that of the other shares.
+        ``chance`` (P, 7) are observations at chance places more than :data:`SIGHT` from ``leader`` (x, y, ...); drives
+        nearer to it are ignored, too. ``background`` is that of the other shares.
         """
         self._look_back(background)
         weights, count = self._drives.weights.astype(np.float32), float(self._count)
         if leader is not None and count:
             weights *= np.linalg.norm(self._drives.poses[:, :2] - leader[:2], axis=1) > SIGHT
-            # drives of earlier keyframes end all over the map like the newest; more of them may end far from the leader
+            # presumed of earlier drives, too; if more of them end far from the leader, the maximum below counts
             count *= float((np.linalg.norm(self._at - leader[:2], axis=1) > SIGHT).mean())
         scored = _odds_against(chance, background)
         anywhere = _odds_against(self._drives.observed.mean(axis=1), background)
@@ -153,7 +153,7 @@ class OpenPlaces:
 
 
 def _ground(scan: ObservedScan) -> ScanPart:
-    """Return the few ground and free points of a scan; without ground its structure shows what is surveyed."""
+    """Return the few ground and free points of a scan; without ground, some structure shows the surveyed part."""
     points = scan.few.points
     return replace(scan.few, points=replace(points, structure=points.structure[: 0 if len(points.low) else None : 8]))
 

@@ -5,8 +5,8 @@ direction at each keyframe, and neighbouring places have nearly equal evidence. 
 keyframes, so the poses of a place are smoothed to a path, and the path is shifted and turned as a whole to the largest
 evidence of all keyframes.
 
-The ratio of a place is the mean over equally probable shifts. A mean of ratios against chance is one, too: chance
-exceeds R with probability 1 / R at most. The factor of a turn is the mean over turns at the best shift.
+The likelihood ratio of a place is the mean over equally probable shifts. A mean of ratios against chance is again a
+ratio: chance exceeds R with probability 1 / R at most. Turns at the best shift add a factor, their mean against none.
 """
 
 from __future__ import annotations
@@ -37,10 +37,10 @@ class Settled(NamedTuple):
     poses: Floats  # (P, 4) at the newest keyframe, best first shifted, then turned
     observed: Floats32  # (P, 15) mean observations there
     shifted: Floats  # (P, S, 4) poses of all shifts at the newest keyframe
-    table: Floats  # (P, S) log-likelihood ratios of the shifts against chance, at the mean turn
+    table: Floats  # (P, S) log-likelihood ratios of the shifts against chance, with the mean factor of turns
 
     def ratios(self, count: Bools | None = None) -> Floats:
-        """Return the log-likelihood ratios (P,) of the places, by the shifts that ``count`` (P, S), default all."""
+        """Return log-likelihood ratios (P,) of the places, by the shifts in the mask ``count`` (P, S), default all."""
         table = self.table if count is None else np.where(count, self.table, -np.inf)
         return np.asarray(np.logaddexp.reduce(table, axis=1) - np.log(table.shape[1]))
 
@@ -48,7 +48,7 @@ class Settled(NamedTuple):
 def look_back(field: kernels.FieldMap, scans: Sequence[ObservedScan], T_map_odom: Floats) -> tuple[Floats32, Floats]:
     """Return observations (P, W, 15) of scans, oldest first, at places ``T_map_odom`` (P, 4, 4), and poses (P, W, 4).
 
-    Each scan begins at the pose of the next newer one, which undoes odometry's drift, and moves to most hits nearby.
+    Each scan starts at the pose of the next newer scan and moves to most hits nearby, which undoes odometry's drift.
     """
     observed = np.empty((len(T_map_odom), len(scans), NEARBY_VARIANCE.stop), dtype=np.float32)
     poses = np.empty((len(T_map_odom), len(scans), 4))

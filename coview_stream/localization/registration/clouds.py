@@ -42,7 +42,7 @@ class RegistrationCloud:
     height: Floats32  # (N,) metres above the lowest ground nearby
     ground_offset: float = 0.0  # metres by which the ground points have been lowered
     changed: float = 0.0  # share of the ground that was left out, as it differs from the survey's
-    dug: float = 0.0  # largest height of the survey's ground above that ground, metres
+    dug: float = 0.0  # metres from the deepest tenth of the ground's patches up to the survey's ground
 
     @property
     def high(self) -> Bools:

@@ -34,8 +34,8 @@ _ANGLES_FIRST = [3, 4, 5, 0, 1, 2]  # and back again
 _MIN_SHARE = 0.01  # least share of a direction's information; below it the minimum of the pairs is noise
 _STOP_SHIFT = 2e-3  # metres: below the map's noise, and the next step would be a third of it
 _STOP_TURN = 1e-4  # radians
-# of a coarse scale: a finer one continues from its result, with smaller steps, as its radius and trimming keep to near
-# points; four times as much left half of the runs a metre off where crowns pull slowly
+# limits of a coarse scale's last step; a finer scale continues from there, with smaller steps, as its radius and
+# trimming keep to near points. Four times as much left half of the runs a metre off where crowns pull slowly
 _COARSE_SHIFT = 0.015  # metres per metre of the scale
 _COARSE_TURN = 7.5e-4  # radians per metre of the scale
 _COARSE_POINTS = 1500  # up to twice as many are used

@@ -87,7 +87,7 @@ class AdvisedSearch(GlobalSearch):
                 yield driven * along[side], at[side].copy()
 
     def _difference(self, places: list[Pose], there: Floats) -> float:
-        """Return by how much less the most similar other place explains of the first one's view from ``there``."""
+        """Return by how much a view from ``there`` (3,) scores better at the first place than at the best other one."""
         station = int(self.base_map.station_grid.at(there[None])[0])
         eye = there.copy() if station < 0 else np.array([*there[:2], self.base_map.stations[station, 2]])
         eye[2] += EYE

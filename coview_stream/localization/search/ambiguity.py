@@ -1,8 +1,8 @@
 """Ambiguity of a map: the distance that a robot has to drive from its stations until it is localized.
 
-At a station, a virtual scan of the map (:func:`virtual_scan`), with a share of the site changed since the survey, is
-searched for with a search's evidence: among the places voted for by the station's descriptors, and places around it.
-While the error exceeds the risk, the robot drives along the longest open path and adds keyframes.
+A virtual scan of the map at a station (:func:`virtual_scan`), with a share of the site changed since the survey, is
+scored like the keyframe of a search, at places that the station's descriptors vote for and at places around the
+station. While the error exceeds the risk, the robot drives along the longest open path and adds keyframes.
 """
 
 from __future__ import annotations

@@ -44,7 +44,7 @@ class Hypothesis:
     evidence: Evidence | None = None  # at the registered pose
 
     def after(self, T_other_odom: Pose) -> Hypothesis:
-        """Return the hypothesis for the odometry frame, given another frame (4, 4) into which that was turned."""
+        """Return this hypothesis of ``T_map_other`` as one of ``T_map_odom``, by the turn ``T_other_odom`` (4, 4)."""
         T = self.T_map_odom @ T_other_odom
         registration = None if self.registration is None else self.registration._replace(T_map_source=T)
         return replace(self, T_map_odom=T, registration=registration)

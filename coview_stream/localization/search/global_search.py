@@ -33,7 +33,7 @@ _STREET = 12.0  # metres from the leader: reach of the farthest hypothesis aroun
 
 @dataclass(frozen=True)
 class Reading:
-    """A reading of a keyframe, level or leaning, and its places."""
+    """A keyframe, either as levelled or rotated further by the leader's lean, and the places scored with it."""
 
     request: SearchRequest  # the keyframe, rotated about the body
     scan: ObservedScan  # of the keyframe
@@ -45,7 +45,7 @@ class Reading:
 
     @property
     def leans(self) -> bool:
-        """Whether it is leaning: earlier scans are not levelled like its own."""
+        """Whether the keyframe is rotated by a lean, so that the earlier scans are not levelled like its own."""
         return not np.array_equal(self.turn, np.eye(4))
 
 
@@ -199,11 +199,11 @@ class GlobalSearch:
         return levelled_by_frame(leader.T_map_odom, request, self.config.registration, self._local_maps)
 
     def _leaning(self, upright: Reading, hypotheses: list[Hypothesis], ranks: list[int], hints: int) -> Reading | None:
-        """Return the reading of the scan by the leader's lean; None for a small lean, or if it leads to another place.
+        """Return the keyframe rotated by the leader's lean, and its places; None for a small lean or another leader.
 
         A sensor leans alike at all places: all are scored again by this keyframe alone, among chance places of the same
-        lean. As the lean was fitted, the reading counts with the lean's prior probability, and that of a later keyframe
-        as another start.
+        lean. As the lean was fitted, its prior probability counts, and each keyframe so far counts as another start of
+        the search.
         """
         request, leader, seen = upright.request, upright.leader, upright.level
         if leader is None or seen is None:
@@ -254,7 +254,7 @@ class GlobalSearch:
     def _guessed(self, request: SearchRequest) -> list[Hypothesis]:
         """Return the best few poses of a guess, on the ground, whenever they are due.
 
-        With all of its poses around one place, these would count as chance places of the map.
+        All poses of a guess lie around one place; more of them would pass for chance places of the map.
         """
         due = self._guesses.due(request.guesses)
         if not due:

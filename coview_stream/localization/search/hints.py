@@ -28,7 +28,7 @@ _MAX_POSES = 400
 
 _TRIES = 5  # successive keyframes that must refute all hints before these are tried less often
 _PAUSE = 4  # keyframes between two later tries
-_GROWTH = 1.25  # factor on a circle's radius, at first and per step: no new step within a quarter of it
+_GROWTH = 1.25  # factor on a circle's radius, at first and per step: a quarter of the radius is driven without a step
 
 MAX_DISTANCE = 20.0
 """Maximum distance around a guess that is tried, metres."""
@@ -146,9 +146,9 @@ def require_ground(guess: PlaceGuess, base_map: BaseMap) -> None:
 
 
 class PoseHints:
-    """Hints of a localizer to its search, stored as ``T_map_odom`` of the raw odometry frame.
+    """Hints of a localizer to its search, stored as ``T_map_odom`` of corrected odometry about its own origin.
 
-    The localizer moves that frame's origin to an anchor, a new one after each loss; here the move is undone.
+    The localizer moves this origin to an anchor, to a new one after each loss; here the move is undone.
 
     Attributes:
         circle: circle on the map, metres from its zero, in which the robot is said to be; None for none.
@@ -202,9 +202,9 @@ class PoseHints:
         self._awaited = (T_map_body,)
 
     def odometry_jumped(self, anchor: Floats, T_odom_body: Pose) -> None:
-        """Hint at the body's places by all hints before a jump of odometry, with the arguments of :meth:`about`.
+        """Turn all hints into places of the body at the frame before a jump of odometry; args as in :meth:`about`.
 
-        Guesses end, and circles, too.
+        Guesses and circles end.
         """
         places = tuple(T @ pose_from(np.eye(3), anchor) @ T_odom_body for T in (*self._known, *self._led))
         places = (*self._awaited, *places)

@@ -88,7 +88,7 @@ class KeyframeBuffer:
         self.calibration = scan.calibration
         leans = any(self.calibration.leans_from(earlier) > _SMEARED for earlier in self._gathered_by)
         at = self._levelled_at
-        # the position of the last levelling shows nothing new
+        # not again before the robot has driven on: at one position frames show nothing new
         anew = leans and (at is None or float(np.linalg.norm(scan.position - at)) >= self.config.distance)
         if anew:
             self._gather_again()

@@ -107,7 +107,7 @@ class SearchStations:
     def alike(self, position: Floats, rule: ConsensusConfig) -> Floats:
         """Return transforms (K, 4, 4) that lead from a position (3,) of the map to places with similar surroundings.
 
-        Surroundings are compared by the direction of their codes, not by their sizes: near the border half is missing.
+        Codes are compared as vectors by their direction alone, not by their length: near the border half is missing.
         """
         codes, every = self.index.codes, self.grid.stations
         if self.squares is not None:

@@ -46,8 +46,8 @@ _PROMISING = 96  # best hypotheses that are looked up with many points
 _FOLLOWED = 64  # best places that the next keyframe observes again
 _KEPT = 16  # places kept by their evidence, whatever their rank at the newest keyframe
 _SETTLED = 8  # best places that are moved to one pose for all keyframes
-_BEHIND = 12.0  # ratio less than the first place's from which on a place is not moved: odds of 6e-6
-_ASIDE = 3.0  # metres: beside the first place, its modes are compared; error from which on benchmarks call a fix false
+_BEHIND = 12.0  # difference of log-ratios to the first place from which on a place is not moved: odds of 6e-6
+_ASIDE = 3.0  # metres from the first place: nearer poses are its modes; benchmarks call a farther fix false
 _NOWHERE = -60.0  # ratio of a place without a shift that counts: finite, as messages have to be
 _FINER = 0.5, np.radians(0.5)  # metres, radians within which the newest keyframe's own pose is better
 _KEYFRAMES = 12  # keyframes with observations: the newest and the most spread earlier ones
@@ -218,8 +218,8 @@ class PlaceScorer:
     def beside(self, T_map_odom: Floats) -> Floats:
         """Return log-likelihood ratios (M,) of poses (M, 4, 4) beside the most probable place.
 
-        At all keyframes they lie equally far from the place's path. Chance is the same at all of them, and so is its
-        error.
+        A pose shifts the place's whole path, by the same step at all keyframes. Chance is the same for all poses, as is
+        its error.
         """
         layers, first = self._base_map.field, self._followed[np.arange(1)]
         newest = self._scans[-1].poses(first.hypotheses[0].T_map_odom[None])
@@ -308,9 +308,9 @@ class PlaceScorer:
     def _settled(
         self, followed: Followed, ratios: Floats, variances: Floats, scan: ObservedScan
     ) -> tuple[Followed, Floats, Floats]:
-        """Move the places that lead to one pose for all keyframes; return the places, their ratios and variances.
+        """Move each leading place to one pose for all keyframes; return the places, their ratios and variances.
 
-        A place whose keyframes lead to the first place has the evidence of the shifts that are not beside it.
+        If this moves a place to the first place, only the evidence of its shifts that are not beside the first counts.
         """
         order = np.argsort(np.log1p(followed.votes) - ratios, kind="stable")
         top = order[:_SETTLED]
@@ -384,7 +384,7 @@ class PlaceScorer:
     def _over_time(self, places: Floats, shares: Floats32, scan: ObservedScan) -> tuple[Floats, Floats32]:
         """Return poses (S, 4) of chance places at a keyframe, and observations (S, W, 15) there at all keyframes.
 
-        They are the last keyframe's newest, and some of ``places`` (N, 4), best first, observed as ``shares`` (N, 15).
+        They are the newest of the last keyframe, and some of ``places`` (N, 4), best first, seen as ``shares`` (N, 15).
         """
         layers, (poses, history) = self._base_map.field, self.chance
         poses, history = poses[_RENEWED - _CHANCE :], history[_RENEWED - _CHANCE :]

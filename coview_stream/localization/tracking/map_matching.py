@@ -207,11 +207,11 @@ class MapMatcher:
     def against_odometry(
         self, match: MapMatch, scan: ObservedScan, tries: list[MapMatch], belief: Estimate, travelled: float
     ) -> MapMatch:
-        """Judge the best of ``tries``, which fits but contradicts odometry: the place moves if the scans support that.
+        """Judge the best of ``tries``, which fits but contradicts ``belief``, odometry's pose.
 
-        If the two places are near enough for either to be right, the lidar is believed, without a pose until the next
-        frame agrees. Within odometry's drift there is no contradiction. If the heights differ by more than the drift,
-        odometry is right, as no wheel slips upwards. ``belief`` is odometry's.
+        Within odometry's drift there is no contradiction. If the two poses are near enough for both to be right, the
+        lidar is believed, without a pose until the next frame agrees; but not if their heights differ by more than the
+        drift, as no wheel slips upwards. Else the place moves only if the evidence of the scans supports that.
         """
         rule, T_map_predicted = self._config.acceptance, belief.T_map_body
         plausible = match.innovation <= rule.max_innovation
@@ -271,8 +271,8 @@ class MapMatcher:
 def best_of(tries: list[MapMatch], limit: float) -> MapMatch:
     """Return the most probable of some matches of one scan, of which the first begins at odometry's pose.
 
-    A pose's prior is odometry's, whose innovation D counts as -D / 2, but no less than a slip's. If the best one does
-    not fit, one that fits but contradicts odometry by more than ``limit`` is returned, for the dispute.
+    The log-prior of a pose is -D / 2, with D its innovation against odometry, but not below that of a slip. If the best
+    match does not fit, one that fits but contradicts odometry by more than ``limit`` is returned, for the dispute.
     """
     usable = [each for each in tries if each.scan is not None and each.verdict.cause is not RejectionReason.TILT]
 

@@ -102,7 +102,7 @@ class DriftEstimator:
         """
         nominal = self._nominal.variances(driven, turned)
         now = self.drift.variances(driven, turned)
-        # keep negative ones, as their mean would be biased
+        # squares less than their noise become negative and stay so: otherwise their mean would be biased
         squares = np.minimum(gap**2, _OUTLIER * (now + noise))
         self._count = min(self._count + 1.0, _MAX_COUNT)
         self._tilt += (float(squares[:2].mean()) / 2.0 - self._tilt) / self._count
@@ -191,7 +191,7 @@ class OdometryTracker:
         return inverse(self._keyframe.T_odom_body) @ T_odom_body
 
     def change(self) -> Floats:
-        """Return the derivative (3,) by the delay, seconds, of the motion since the newest keyframe, start axes."""
+        """Return the derivative (3,) by the delay of the motion since the newest keyframe: x, y, yaw in its axes."""
         motion = np.eye(4) if self.pose is None else self.motion(self.pose)
         return np.asarray(motion_jacobian(motion, np.array([_rates(self._keyframe.moment), self.rates]))[:, 2])
 

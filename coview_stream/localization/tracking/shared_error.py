@@ -71,7 +71,7 @@ class SharedErrorModel:
     ) -> None:
         """Add a registration, ``travelled`` metres into the drive; other arguments as in :func:`disagreement`.
 
-        One per two metres counts, as those between see the same. One at -inf is replaced by the next.
+        One registration per two metres counts, as those between see the same. The next replaces a registration at -inf.
         """
         before = self._learned_at
         if before is not None and travelled - before < _STEP:

@@ -112,9 +112,9 @@ class DisplacementCheck:
 
     A registration is due once a metre. A robot that is lifted and put down elsewhere, or carried with its wheels in the
     air, would have a wrong pose until then. So for every frame, the share of a few hundred points above the ground that
-    have a map point nearby is compared with the usual share. Below 0.7 of it were fewer than 1 % of the frames at the
-    right pose, more than half of those half a metre off, and more than 98 % anywhere else (measured once, on the
-    simulated worlds 5101, 5103, 5106 and 5108; no command prints it).
+    have a map point nearby is compared with the usual share. It was below 0.7 of the usual share in fewer than 1 % of
+    the frames at the right pose, in more than half of those half a metre off, and in more than 98 % anywhere else
+    (measured once, on the simulated worlds 5101, 5103, 5106 and 5108; no command prints it).
     """
 
     usual: float | None = None  # share in [0, 1]; None before the first registration

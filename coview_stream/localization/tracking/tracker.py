@@ -225,8 +225,8 @@ class Tracker:
     def reported_covariance(self, mount_and_clock: bool = True) -> Floats:
         """Covariance (6, 6) over (x, y, z, roll, pitch, yaw), map axes, of the body at the stamp.
 
-        It is the sum of the cloud's by the graph and by odometry since, the error shared by registrations, the jitter
-        of the tilt, the ground's and, unless left out, the errors of mount and clock.
+        It is the sum of the covariances of the cloud's pose by the graph and of odometry since, of the error shared by
+        registrations, the tilt's jitter, the height by the ground and, if ``mount_and_clock``, of mount and clock.
         """
         total = self.predicted_covariance() + self._matcher.shared.covariance + self.odometry.tremble
         total[5, 5] += self.change.others.variance + self.change.alone + self.ground.sigma**2

@@ -64,7 +64,7 @@ class Step:
 def misfits(points: float) -> float:
     """Return the probability that clouds of one place do not fit each other, by a cloud's number of surface points.
 
-    Of 584 steps of seven drives 47 % with 50 to 100 points did not, 36 % to 150, 24 % to 200, 4 % to 300, else 1 %.
+    Of 584 steps of seven drives, 47 % with 50 to 100 points do not fit, 36 % to 150, 24 % to 200, 4 % to 300, else 1 %.
     """
     return ALONE + 0.4 / (1.0 + (points / 150.0) ** 4)
 

@@ -200,7 +200,7 @@ def fit(pairs: Sequence[Pair], reading: Reading = AS_SENT) -> Fit:
         sways += [_sways_odds(each, swayed) for each in (sway, _other_hand(sway))]
         if min(abs(step), abs(driven)) > STILL:
             ratios.append(driven / step)
-    # sways only tell a mirror's sides apart; those of planar odometry do not
+    # sways only decide between this reading and its mirror image; planar odometry has none
     this, other = np.logaddexp(sways, 0.0)
     odds += min(0.0, float(this - other))
     misfit = float(np.median(misfits)) if misfits else math.inf

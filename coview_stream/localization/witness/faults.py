@@ -329,7 +329,7 @@ class FaultPosterior:
                 np.add.at(lags, below + 1, (place - below) * shares)
 
     def rescaled(self, risk: float) -> tuple[float, float] | None:
-        """Return the factor of odometry's wrong scale, and its sigma, once it is certain; the state is good again."""
+        """Return odometry's wrong scale and its sigma once it is certain, and count it as corrected; None before."""
         share = sum(h.weight for h in self.scaled)
         if share < 1.0 - risk:
             return None
@@ -339,7 +339,7 @@ class FaultPosterior:
         return best.scale, best.sigma
 
     def accusation(self, metres: float, radians: float, risk: float) -> Accusation | None:
-        """Return the most probable fault that puts poses off by more than a level, if all together reach a risk."""
+        """Return the likeliest fault that puts poses off beyond a level; None if all together are below ``risk``."""
         wrong: list[Accusation] = []
         if self._driven > metres:
             words = f"the lidar repeats itself: no motion between clouds while odometry drives {self._driven:.1f} m"

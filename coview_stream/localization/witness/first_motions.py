@@ -179,8 +179,8 @@ class Conventions:
 
     Attributes:
         finding: why clouds and odometry are unusable as sent, and the remedy; None while nothing is found.
-        plausible: they surely fit as sent; a straight drive may hide a mirror or odometry's wrong turns.
-        settled: they surely are correct.
+        plausible: clouds and odometry surely fit as sent; a straight drive may hide a mirror or odometry's wrong turns.
+        settled: clouds and odometry surely are correct.
         doubtful: not plausible yet, and odometry more probably does not follow the clouds.
     """
 

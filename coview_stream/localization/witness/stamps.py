@@ -53,7 +53,7 @@ class StepStamps(NamedTuple):
         return longest - self.usual if longest > _BEYOND * self.usual else 0.0
 
     def stalled(self, lags: Floats) -> Floats:
-        """Return the shares (L,) of lags (L,) that may start in a hole: without the lag it is a usual interval."""
+        """Return the shares (L,) of lags (L,) that explain the hole: shorter by the lag, it is a usual interval."""
         rest = float(self.seconds.max()) - lags
         likely = np.where(rest > _BEYOND * self.usual, 0.0, self._likelihood(rest, _BIN)) * (lags > 0.0)
         return likely / likely.sum() if self.hole and likely.any() else 0.0 * likely

@@ -202,7 +202,7 @@ class Witness:
         return seconds >= _SECONDS or far >= _FAR or (moved and seconds >= _SHORTEST)
 
     def _may_hide_turns(self) -> bool:
-        """Return whether the step has many frames, an even number: of two alternating drivers it shows just one."""
+        """Return whether the step has many frames, an even number: if two drivers alternate, both ends are of one."""
         assert self._newest is not None
         assert self._reference is not None
         frames = self._newest.number - self._reference.number
