@@ -47,6 +47,7 @@ class Drive(NamedTuple):
     noise: float = 0.0  # radians of odometry's heading at each of its steps
     every: int = 10  # tenths of a second between registrations
     seed: int = 1
+    turn: float = 0.0  # radians per metre of odometry's heading
 
     def learnt(self, earlier=None, stated=0.0, drawn=True):
         """Return the estimator after the drive."""
@@ -61,7 +62,8 @@ class Drive(NamedTuple):
             late = estimator.calibration.delay
             before = None if newest is None else history.at(newest - late)
             now = self.at(stamp - max(-self.delay, 0.0))
-            turned = rot_z(rng.normal(0.0, self.noise)) if self.noise else np.eye(3)
+            wrong = self.turn * float(np.linalg.norm(now[:2, 3] - before_it[:2, 3]))
+            turned = rot_z(wrong + (rng.normal(0.0, self.noise) if self.noise else 0.0))
             T_odom, before_it = T_odom @ inverse(before_it) @ now @ pose_from(turned, np.zeros(3)), now
             history.add(stamp, T_odom)
             newest = stamp
@@ -94,6 +96,12 @@ def test_delay_is_measured_where_the_robot_turns_and_accelerates(delay):
     assert found.sigma_delay < 0.01
     assert abs(np.degrees(found.heading)) < 0.1
     assert np.hypot(found.lever_x, found.lever_y) < 0.02
+
+
+def test_a_delay_and_a_turn_of_odometry_are_told_apart():
+    found = Drive(WINDING, 0.3, turn=np.radians(0.3)).learnt().calibration
+    assert found.delay == pytest.approx(0.3, abs=0.01)
+    assert np.degrees(found.turn) == pytest.approx(-0.3, abs=0.05)
 
 
 @pytest.mark.parametrize("seed", [100, 102, 103, 104])
