@@ -3,8 +3,8 @@
 Two hypotheses are compared: the robot is at the tracked place, or it is not (odometry jumped, the robot was carried,
 the place was wrong from the start). A registration weighs them by its log-likelihood ratio
 (:mod:`coview_stream.localization.tracking.place_evidence`); driving makes the second slightly more probable. Poses are
-reported while its probability is below the integrity risk; above one half the place is lost, which takes two views, as
-a scan may show nothing of the right place. docs/integrity.md has the equations.
+reported while its probability is below the integrity risk; above one half the place is lost, which takes two views at
+the usual risk, as a scan may show nothing of the right place. docs/integrity.md has the equations.
 """
 
 from __future__ import annotations
