@@ -163,6 +163,8 @@ class GlobalSearch:
         if leader is not None:
             scored = self._gathered(scored, leader, scan, request)
             if scored.error < self.config.acceptance.risk:
+                scored = scored.beside(self._registered_rivals(reading, leader))
+            if scored.error < self.config.acceptance.risk:
                 place = scored.places[0]
                 modes = find_modes(
                     place, leader, scan, request, self.base_map, self.config, self._local_maps, reading.scorer.beside
@@ -178,6 +180,31 @@ class GlobalSearch:
         if result.accepted is not None:
             result = replace(result, accepted=result.accepted.after(reading.turn))
         return result
+
+    def _registered_rivals(self, reading: Reading, leader: Hypothesis) -> list[Hypothesis]:
+        """Return the leader's best rivals, registered, with their odds against it.
+
+        A rival may have moved to a pose half a metre off its best one, where a copy of the leader explains far less.
+        The next keyframe starts from the registered poses.
+        """
+        request, scan, wide = reading.request, reading.scan, self.config.registration.search[0]
+
+        def beside(T_map_odom: Pose, of: Hypothesis) -> bool:
+            return same_place(T_map_odom, of.T_map_odom, request, BASIN_DISTANCE, BASIN_ANGLE)
+
+        firsts = leader, reading.scored.places[0]
+        rivals = [place for place in reading.scored.places if not any(beside(place.T_map_odom, of) for of in firsts)]
+        rivals = sorted(rivals, key=lambda place: -place.ratio)[:_NAMED]
+        poses = [
+            found.T_map_odom for place in rivals
+            if (found := register_place(place, scan, self.base_map, self.config, self._local_maps, widest=wide))
+            and not any(beside(found.T_map_odom, of) for of in firsts)
+        ]  # fmt: skip
+        if not poses:
+            return []
+        out = reading.scorer.at_their_best(leader.T_map_odom, np.array(poses), scan)
+        self._named = [*((place, int(reading.scorer.followed.votes[0])) for place in out), *self._named]
+        return out
 
     def _alike(self, reading: Reading) -> list[Hypothesis]:
         """Return places that look like a probable leader's on the map, with their odds against it.

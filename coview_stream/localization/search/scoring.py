@@ -19,7 +19,7 @@ import numpy as np
 from coview_kernels import Move
 from coview_stream.basemap.basemap import BaseMap
 from coview_stream.geometry.arrays import Floats, Floats32, Ints
-from coview_stream.geometry.transforms import Circle
+from coview_stream.geometry.transforms import Circle, Pose
 from coview_stream.localization.evidence.background import (
     NEARBY_VARIANCE,
     Most,
@@ -35,7 +35,7 @@ from coview_stream.localization.evidence.likelihood import (
     posterior,
     ratio_variances,
 )
-from coview_stream.localization.evidence.observation import ObservedScan, Share, surroundings
+from coview_stream.localization.evidence.observation import Observations, ObservedScan, Share, surroundings
 from coview_stream.localization.evidence.open_places import SIGHT, OpenPlaces
 from coview_stream.localization.evidence.paths import Paths, look_back
 from coview_stream.localization.search.consensus import Hypothesis
@@ -55,6 +55,7 @@ _NEWEST = 8  # newest keyframes, searched for a moved part
 _CHANCE = 112  # places that measure the correlation of chance over keyframes
 _RENEWED = 28  # of them, the oldest, replaced at each keyframe: only new ones are looked up at the earlier ones
 _CHANCE_REACH = 6.0, np.radians(20.0)  # metres, radians from the leader; closer places share its explanation
+_AT_BEST = np.array([(x, y, 0.0, 0.0) for x in (-0.5, -0.25, 0.0, 0.25, 0.5) for y in (-0.5, -0.25, 0.0, 0.25, 0.5)])
 AROUND = np.array([(r * np.cos(a), r * np.sin(a)) for r in (3.5, 7.0) for a in np.arange(8) * np.pi / 4])
 """Shifts of the leader, metres, as further hypotheses: along a corridor it may be anywhere."""
 
@@ -189,7 +190,7 @@ class PlaceScorer:
 
         They have the leader's prior probability, as no vote has ranked them, and the background of the newest keyframe.
         """
-        layers, scans = self._base_map.field, self._scans
+        layers = self._base_map.field
         known = scan.poses(np.array([place.T_map_odom for place in self._followed.hypotheses]))
         part = scan.many.look_up(layers, scan.few.look_up(layers, scan.poses(T_map_odom), Move.FAR).poses, Move.NEAR)
         new = [
@@ -197,8 +198,30 @@ class PlaceScorer:
             if apart(known, part.poses[group[0]], SAME_DISTANCE, SAME_ANGLE).all()
             and apart(part.poses[group[:1]], known[0], BASIN_DISTANCE, BASIN_ANGLE).all()
         ]  # fmt: skip
-        if not new:
-            return []
+        return self._against_leader(part, new, scan) if new else []
+
+    def at_their_best(self, leader: Pose, T_map_odom: Floats, scan: ObservedScan) -> list[Hypothesis]:
+        """Return registered poses (H, 4, 4) of other places, with their odds against the leader, registered likewise.
+
+        Each, and the leader, is at the pose within half a metre that the newest keyframe's evidence prefers: over half
+        a metre the evidence may change more than between a place and its copy.
+        """
+        poses, layers = scan.poses(np.stack([leader, *T_map_odom])), self._base_map.field
+        grid = (poses[:, None] + _AT_BEST).reshape(-1, 4)
+        part, around = scan.many.look_up(layers, grid, Move.HEIGHT), observe_around(layers, scan.few, poses)
+        shares = np.column_stack([part.shares, np.repeat(around, len(_AT_BEST), axis=0)])
+        ratios = log_likelihood_ratios(shares, self._background).reshape(len(poses), -1)
+        best = ratios.argmax(axis=1) + len(_AT_BEST) * np.arange(len(poses))
+        return self._against_leader(part, best.tolist(), scan, first=1)
+
+    def _against_leader(
+        self, part: Observations, new: list[int], scan: ObservedScan, first: int = 0
+    ) -> list[Hypothesis]:
+        """Return the ``new`` poses of some with their odds against the leader, by all keyframes.
+
+        Those before the ``first`` are further poses of the leader.
+        """
+        layers, scans = self._base_map.field, self._scans
         at = scan.transforms(part.poses[new])
         newest = np.column_stack([part.shares[new], observe_around(layers, scan.few, part.poses[new])])
         seen, poses = look_back(layers, scans[:-1], at)
@@ -209,11 +232,10 @@ class PlaceScorer:
             poses = np.concatenate([poses, part.poses[new][:, None]], axis=1)
             ratios = np.maximum(ratios, Paths.of(layers, scans, poses, each).settled(self._background).ratios())
         leader, variance = self._leader
+        leader = np.maximum(leader, ratios[:first].max(initial=-np.inf))
         odds = odds_of(leader - ratios, variance + self._left * ratio_variances(observed, self._background))
-        return [
-            Hypothesis(T, score=float(score), ratio=float(ratio), probability=float(each))
-            for T, score, ratio, each in zip(at, part.scores[new], ratios, odds, strict=True)
-        ]
+        rows = zip(at, part.scores[new].tolist(), ratios.tolist(), odds.tolist(), strict=True)
+        return [Hypothesis(T, score=score, ratio=ratio, probability=each) for T, score, ratio, each in rows][first:]
 
     def beside(self, T_map_odom: Floats) -> Floats:
         """Return log-likelihood ratios (M,) of poses (M, 4, 4) beside the most probable place.

@@ -203,6 +203,18 @@ def test_keyframes_that_name_no_place_do_not_shift_the_others(scorer, world_map,
     assert np.diagonal(apart).max() < 0.7 * apart.mean()
 
 
+def test_rivals_are_compared_at_their_best_pose(scorer, scan):
+    """Half a metre beside the right pose much less is explained; moved back, it is as good as the leader."""
+    leader = scored(scorer, some_places(scan), scan).places[0]
+    beside = leader.T_map_odom.copy()
+    beside[:2, 3] += 0.5, -0.5
+    moved, wrong = scorer.at_their_best(leader.T_map_odom, np.array([beside, off(20.0, 5.0, 70.0, scan)]), scan)
+    ratio = scorer.beside(beside[None])[0]
+    assert moved.ratio > ratio + 5.0
+    assert moved.probability > 0.3
+    assert wrong.probability < 1e-4
+
+
 def test_two_readings_of_a_scan_are_weighed_by_their_prior(world_map, world_drive):
     """The odds of places against "none" add up; "none" is one and the same."""
     scan = scan_of(world_drive, 0)
