@@ -151,25 +151,25 @@ class GlobalSearch:
         best = sorted(alike, key=lambda place: -place.probability)[:_NAMED]
         self._named = [(place, int(reading.scorer.followed.votes[0])) for place in best]
         reading = replace(reading, scored=reading.scored.beside(alike))
-        result = self._decide(reading)
+        result, scored = self._decide(reading)
         if result.accepted is not None:
             self.clear()
-        return replace(result, considered=Considered.of(reading.scored, request, self.base_map.origin))
+        return replace(result, considered=Considered.of(scored, request, self.base_map.origin))
 
-    def _decide(self, reading: Reading) -> SearchResult:
+    def _decide(self, reading: Reading) -> tuple[SearchResult, Scored]:
         """Decide on a keyframe's first place by its rivals along the street, its modes, and moved parts."""
         request, scan, scored, leader = reading.request, reading.scan, reading.scored, reading.leader
         undecided = 0.0
         if leader is not None:
             scored = self._gathered(scored, leader, scan, request)
             if scored.error < self.config.acceptance.risk:
-                scored = scored.beside(self._registered_rivals(reading, leader))
-            if scored.error < self.config.acceptance.risk:
                 place = scored.places[0]
                 modes = find_modes(
                     place, leader, scan, request, self.base_map, self.config, self._local_maps, reading.scorer.beside
                 )
                 leader, undecided = modes.best, modes.undecided
+                if not undecided:
+                    scored = scored.beside(self._registered_rivals(reading, leader))
             if scored.error < 0.5:  # a stated error has to be true even if nothing follows from it
                 scans = [scan] if reading.leans else [*self._scorer.scans[:-1], scan]
                 scored = scored.doubted(find_moved_part(self.base_map.field, scans, leader.T_map_odom))
@@ -179,32 +179,38 @@ class GlobalSearch:
             result = replace(result, leader=level @ reading.turn)
         if result.accepted is not None:
             result = replace(result, accepted=result.accepted.after(reading.turn))
-        return result
+        return result, scored
 
     def _registered_rivals(self, reading: Reading, leader: Hypothesis) -> list[Hypothesis]:
-        """Return the leader's best rivals, registered, with their odds against it.
+        """Return the leader's best rivals, registered, with what their odds against it gain by that.
 
         A rival may have moved to a pose half a metre off its best one, where a copy of the leader explains far less.
         The next keyframe starts from the registered poses.
         """
-        request, scan, wide = reading.request, reading.scan, self.config.registration.search[0]
+        request, scan, scored = reading.request, reading.scan, reading.scored
+        taken, rivals = [leader.T_map_odom, scored.places[0].T_map_odom], list[int]()
 
-        def beside(T_map_odom: Pose, of: Hypothesis) -> bool:
-            return same_place(T_map_odom, of.T_map_odom, request, BASIN_DISTANCE, BASIN_ANGLE)
+        def new(T_map_odom: Pose) -> bool:
+            return not any(same_place(T_map_odom, T, request, BASIN_DISTANCE, BASIN_ANGLE) for T in taken)
 
-        firsts = leader, reading.scored.places[0]
-        rivals = [place for place in reading.scored.places if not any(beside(place.T_map_odom, of) for of in firsts)]
-        rivals = sorted(rivals, key=lambda place: -place.ratio)[:_NAMED]
-        poses = [
-            found.T_map_odom for place in rivals
-            if (found := register_place(place, scan, self.base_map, self.config, self._local_maps, widest=wide))
-            and not any(beside(found.T_map_odom, of) for of in firsts)
-        ]  # fmt: skip
-        if not poses:
+        order = sorted(range(len(scored.places)), key=lambda k: -scored.places[k].ratio)
+        for k in [k for k in order if new(scored.places[k].T_map_odom)][:_GUESSES]:
+            place, widest = scored.places[k], self.config.registration.search[0]
+            found = register_place(place, scan, self.base_map, self.config, self._local_maps, widest=widest)
+            if new((found or place).T_map_odom) and len(rivals) < _NAMED:
+                taken.append((found or place).T_map_odom)
+                rivals.append(k)
+        if not rivals:
             return []
-        out = reading.scorer.at_their_best(leader.T_map_odom, np.array(poses), scan)
-        self._named = [*((place, int(reading.scorer.followed.votes[0])) for place in out), *self._named]
-        return out
+        ranks, right = reading.scorer.followed.votes, max(1.0 - scored.error, 1e-9)
+        out = reading.scorer.at_their_best(leader.T_map_odom, np.array(taken[2:]), scan)
+        self._named = [*((place, int(ranks[0])) for place in out if place.probability > 0.0), *self._named]
+        gains = []
+        for k, place in zip(rivals, out, strict=True):  # a rank that is better than the leader's counts
+            prior = max(1.0, (1.0 + ranks[0]) / (1.0 + ranks[k])) if k < len(ranks) else 1.0
+            gain = prior * place.probability - scored.places[k].probability / right
+            gains.append(replace(place, probability=max(0.0, float(gain))))
+        return gains
 
     def _alike(self, reading: Reading) -> list[Hypothesis]:
         """Return places that look like a probable leader's on the map, with their odds against it.

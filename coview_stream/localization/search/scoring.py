@@ -212,7 +212,9 @@ class PlaceScorer:
         shares = np.column_stack([part.shares, np.repeat(around, len(_AT_BEST), axis=0)])
         ratios = log_likelihood_ratios(shares, self._background).reshape(len(poses), -1)
         best = ratios.argmax(axis=1) + len(_AT_BEST) * np.arange(len(poses))
-        return self._against_leader(part, best.tolist(), scan, first=1)
+        aside = apart(part.poses[best[1:]], part.poses[best[0]], BASIN_DISTANCE, BASIN_ANGLE)
+        out = self._against_leader(part, best.tolist(), scan, first=1)
+        return [place if other else replace(place, probability=0.0) for place, other in zip(out, aside, strict=True)]
 
     def _against_leader(
         self, part: Observations, new: list[int], scan: ObservedScan, first: int = 0
@@ -230,7 +232,13 @@ class PlaceScorer:
         ratios = log_likelihood_ratios(observed, self._background)
         if len(scans) > 1:  # as the leader's
             poses = np.concatenate([poses, part.poses[new][:, None]], axis=1)
-            ratios = np.maximum(ratios, Paths.of(layers, scans, poses, each).settled(self._background).ratios())
+            found = Paths.of(layers, scans, poses, each).settled(self._background)
+            aside = None
+            if first:  # shifts of a rival that lead to the leader are no evidence for the rival
+                aside = apart(found.shifted.reshape(-1, 4), part.poses[new[0]], _ASIDE, BASIN_ANGLE)
+                aside = aside.reshape(found.table.shape)
+                aside[:first] = True
+            ratios = np.maximum(ratios, found.ratios(aside))
         leader, variance = self._leader
         leader = np.maximum(leader, ratios[:first].max(initial=-np.inf))
         odds = odds_of(leader - ratios, variance + self._left * ratio_variances(observed, self._background))

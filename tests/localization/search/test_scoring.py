@@ -204,11 +204,11 @@ def test_keyframes_that_name_no_place_do_not_shift_the_others(scorer, world_map,
 
 
 def test_rivals_are_compared_at_their_best_pose(scorer, scan):
-    """Half a metre beside the right pose much less is explained; moved back, it is as good as the leader."""
+    """Half a metre beside the right pose much less is explained; moved back, it is as good as the leader was."""
     leader = scored(scorer, some_places(scan), scan).places[0]
-    beside = leader.T_map_odom.copy()
+    beside, elsewhere = leader.T_map_odom.copy(), off(-20.0, 5.0, 70.0, scan)
     beside[:2, 3] += 0.5, -0.5
-    moved, wrong = scorer.at_their_best(leader.T_map_odom, np.array([beside, off(20.0, 5.0, 70.0, scan)]), scan)
+    moved, wrong = scorer.at_their_best(elsewhere, np.array([beside, off(20.0, 5.0, 70.0, scan)]), scan)
     ratio = scorer.beside(beside[None])[0]
     assert moved.ratio > ratio + 5.0
     assert moved.probability > 0.3
