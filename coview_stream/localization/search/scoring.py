@@ -55,6 +55,7 @@ _NEWEST = 8  # newest keyframes, searched for a moved part
 _CHANCE = 112  # places that measure the correlation of chance over keyframes
 _RENEWED = 28  # of them, the oldest, replaced at each keyframe: only new ones are looked up at the earlier ones
 _CHANCE_REACH = 6.0, np.radians(20.0)  # metres, radians from the leader; closer places share its explanation
+# metres: shifts (25, 4) of poses x, y, z and heading among which a rival's best pose is
 _AT_BEST = np.array([(x, y, 0.0, 0.0) for x in (-0.5, -0.25, 0.0, 0.25, 0.5) for y in (-0.5, -0.25, 0.0, 0.25, 0.5)])
 AROUND = np.array([(r * np.cos(a), r * np.sin(a)) for r in (3.5, 7.0) for a in np.arange(8) * np.pi / 4])
 """Shifts of the leader, metres, as further hypotheses: along a corridor it may be anywhere."""
@@ -201,10 +202,10 @@ class PlaceScorer:
         return self._against_leader(part, new, scan) if new else []
 
     def at_their_best(self, leader: Pose, T_map_odom: Floats, scan: ObservedScan) -> list[Hypothesis]:
-        """Return registered poses (H, 4, 4) of other places, with their odds against the leader, registered likewise.
+        """Return H other places with their odds against the leader, by registered poses (4, 4) and (H, 4, 4).
 
-        Each, and the leader, is at the pose within half a metre that the newest keyframe's evidence prefers: over half
-        a metre the evidence may change more than between a place and its copy.
+        Each, and the leader, is moved to the pose, of 25 around it, that the newest keyframe's evidence prefers: half a
+        metre may change the evidence more than a copy. Zero odds if a place is moved to the leader.
         """
         poses, layers = scan.poses(np.stack([leader, *T_map_odom])), self._base_map.field
         grid = (poses[:, None] + _AT_BEST).reshape(-1, 4)
@@ -219,9 +220,9 @@ class PlaceScorer:
     def _against_leader(
         self, part: Observations, new: list[int], scan: ObservedScan, first: int = 0
     ) -> list[Hypothesis]:
-        """Return the ``new`` poses of some with their odds against the leader, by all keyframes.
+        """Return places at the rows ``new`` of observed poses, from ``first`` on, with their odds against the leader.
 
-        Those before the ``first`` are further poses of the leader.
+        The rows before ``first`` are further poses of the leader. The odds are by all keyframes.
         """
         layers, scans = self._base_map.field, self._scans
         at = scan.transforms(part.poses[new])
