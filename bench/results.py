@@ -20,6 +20,7 @@ from __future__ import annotations
 
 import ast
 import contextlib
+import functools
 import itertools
 import json
 import os
@@ -82,7 +83,7 @@ TABLES = {
     "forest_drives": Table("forest_drives --plots docs/images", 50, True, "forest_drives"),
     "challenge": Table("challenge --count 20", 10, True, "challenge", "20 of 100 runs"),
     "exposure": Table("exposure --worlds 26", 1, False, f"exposure --worlds 1 {SETS_OF_TWO}"),  # of results of those
-    "peers": Table("peers --places 6 --limit 90", 20, True, "peers --limit 60", "6 of 20 places of each world"),
+    "peers": Table("peers --places 6 --limit 90", 28, True, "peers --limit 60", "6 of 20 places of each world"),
     "search": Table("search", 4),
     "engine": Table("engine", 3),
     "memory": Table("memory --km2 0.05 1", 8, False, "memory", "the largest of three maps, which city has"),
@@ -382,10 +383,19 @@ def _made_by(name: str) -> str:
         file = ROOT / f"{module.replace('.', '/')}.py"
         if file.is_file() and file not in files:
             files.append(file)
-            for node in ast.walk(ast.parse(file.read_bytes())):
-                if isinstance(node, ast.ImportFrom) and (node.module or "").startswith("bench"):
-                    for part in ("", *(f".{alias.name}" for alias in node.names)):
-                        add(f"{node.module}{part}")
+            for name in _imported(file.read_bytes()):
+                add(name)
 
     add(f"bench.{BENCHMARKS[TABLES[name].command.split()[0]].module}")
     return f"code {_code()}, bench {fingerprint(*sorted(str(file.relative_to(ROOT)) for file in files))}"
+
+
+@functools.cache
+def _imported(source: bytes) -> tuple[str, ...]:
+    """Return what a module imports from ``bench``: modules, and names that may be modules."""
+    return tuple(
+        f"{node.module}{part}"
+        for node in ast.walk(ast.parse(source))
+        if isinstance(node, ast.ImportFrom) and (node.module or "").startswith("bench")
+        for part in ("", *(f".{alias.name}" for alias in node.names))
+    )

@@ -1,4 +1,6 @@
-"""Other libraries on the same queries, in simulated worlds and real runs: a robot switched on eight metres ago.
+"""Other libraries on the same queries, in simulated worlds, real runs and worlds of real surveys.
+
+A robot was switched on eight metres ago. A survey's world is made of its other half (:mod:`bench.integrity.surveys`).
 
 Each is asked twice: with the submap of the five keyframes since then, and with one scan alone. A trial ends after
 ``--limit`` seconds, so a slow peer answers the first queries only, and the shares of both sides are of those. Extra
@@ -24,20 +26,28 @@ import numpy as np
 
 import coview_kernels
 from bench.__main__ import run
-from bench.accuracy.conditions import SETS, RealSet
+from bench.accuracy.conditions import SETS
 from bench.harness.files import add_data, built, fingerprint, folder, isolated, peak_megabytes, remembered
 from bench.harness.rows import Row, bounded, failed, informs, listed
 from bench.harness.worlds import KEYFRAMES, WORLDS, Place, map_of, places, prepare
+from bench.integrity import surveys
+from bench.integrity.plan import Run as Planned
+from bench.integrity.plan import plan
+from bench.integrity.run import Drive, drive_of
+from bench.integrity.run import map_of as map_of_run
 from bench.speed.registration import SmallGicp
 from coview_stream import BaseMap
 from coview_stream.clouds import read_tum
+from coview_stream.clouds.cloud import Cloud
 from coview_stream.config import LocalizerConfig
 from coview_stream.errors import CoViewError, require_library
 from coview_stream.geometry.arrays import Floats
 from coview_stream.geometry.transforms import Points, Pose, inverse, pose_from
 from coview_stream.localization.registration.clouds import LocalMaps
 from coview_stream.localization.search.global_search import GlobalSearch
+from coview_stream.odometry.deskew import SweepCorrection
 from coview_stream.recordings.open_run import open_run
+from coview_stream.recordings.run import Run as Recorded
 from coview_stream.sim.casting import open3d
 
 
@@ -336,32 +346,70 @@ def _asked(name: str, map_file: str, places_file: str, limit_s: float) -> Iterat
 QUERIES = {"": KEYFRAMES, ", one scan": 1}  # suffix of the world's name, and keyframes of a query
 
 
-def ground_of(scene: str, data: Path) -> tuple[Path, Path]:
-    """Return the map of a simulated world or of a real set, and the folder of its ``run`` and truth, made if needed."""
+@dataclass(frozen=True)
+class DriveClouds:
+    """The clouds of a drive in a survey's world."""
+
+    drive: Drive
+
+    def read(self, index: int, correction: SweepCorrection | None = None) -> Cloud:
+        """Return cloud ``index``, body frame, metres."""
+        return Cloud(self.drive.frame(index), np.zeros(3))
+
+
+def on_surveys() -> dict[str, Planned]:
+    """Return a drive on a map of each survey by its name: the first of the plan of ``integrity`` that has a way."""
+    found = dict[str, Planned]()
+    for first in (site[0] for site in plan("surveys", 400) if site[0].family == "survey"):
+        name = surveys.place_of(first.seed).stem
+        if name not in found and drive_of(first) is not None:
+            found[name] = first
+        if len(found) == len(surveys.files()):
+            break
+    return found
+
+
+def ground_of(scene: str, data: Path) -> Path:
+    """Return the map of a simulated world, a survey or a real set, made if needed."""
     if scene in WORLDS:
-        return map_of(folder(), WORLDS[scene]), prepare(folder(), WORLDS[scene])
-    real = RealSet(data / scene)
-    return built(real.survey, folder() / "conditions" / "maps" / f"{scene}.coview"), real.folder
+        prepare(folder(), WORLDS[scene])
+        return map_of(folder(), WORLDS[scene])
+    if scene in SETS:
+        return built(data / scene / "base.laz", folder() / "conditions" / "maps" / f"{scene}.coview")
+    site = folder() / "peers" / f"{scene}.coview"
+    made = {"code": fingerprint(), "bench": fingerprint("bench/integrity")}
+    site.parent.mkdir(parents=True, exist_ok=True)
+    remembered(site.with_suffix(".json"), made, lambda: map_of_run(on_surveys()[scene]).save(site))
+    return site
 
 
-def _asked_of(site: Path, world: Path, count: int, keyframes: int) -> list[Place]:
-    run, truth = open_run(world / "run"), read_tum(world / "truth.tum")[1]
+def _asked_of(scene: str, data: Path, site: Path, count: int, keyframes: int) -> list[Place]:
+    if scene in (*WORLDS, *SETS):
+        world = prepare(folder(), WORLDS[scene]) if scene in WORLDS else data / scene
+        run, truth = open_run(world / "run"), read_tum(world / "truth.tum")[1]
+    else:
+        drive = drive_of(on_surveys()[scene])
+        assert drive is not None
+        assert drive.truth is not None
+        at = (Path(scene),) * len(drive)
+        run, truth = Recorded(Path(scene), at, drive.stamps, drive.odometry, DriveClouds(drive)), drive.truth
     return places(BaseMap.load(site), run, truth, count, keyframes)
 
 
-def contest(peers: Sequence[str], scenes: dict[str, tuple[Path, Path]], count: int, limit_s: float) -> Iterator[Trial]:
+def contest(peers: Sequence[str], scenes: Sequence[str], data: Path, count: int, limit_s: float) -> Iterator[Trial]:
     """Yield a trial per world, query and peer; ``count`` places per world, ``limit_s`` seconds for each trial."""
-    code = {"code": fingerprint(), "bench": fingerprint("bench/peers", "bench/harness/worlds.py")}
+    code = {"code": fingerprint(), "bench": fingerprint("bench/peers", "bench/harness/worlds.py", "bench/integrity")}
     with tempfile.TemporaryDirectory() as scratch:
-        for scene, (site, world) in scenes.items():
+        for scene in scenes:
+            site = isolated(ground_of, scene, data)
             for suffix, keyframes in QUERIES.items():
                 file = Path(scratch) / f"{scene}{suffix}"
 
-                def make(peer: str, name: str, site: Path = site, world: Path = world, file: Path = file,
+                def make(peer: str, name: str, scene: str = scene, site: Path = site, file: Path = file,
                          keyframes: int = keyframes) -> dict[str, Any]:  # fmt: skip
                     print(f"... {peer}, {name}", file=sys.stderr, flush=True)
                     if not file.is_file():
-                        file.write_bytes(pickle.dumps(isolated(_asked_of, site, world, count, keyframes)))
+                        file.write_bytes(pickle.dumps(isolated(_asked_of, scene, data, site, count, keyframes)))
                     trial = run_trial(peer, name, count, site, file, limit_s)
                     if trial.answers:
                         return asdict(trial)
@@ -385,7 +433,10 @@ def options(parser: ArgumentParser) -> None:
     add_data(parser)
     parser.add_argument("--trial", nargs=3, help=SUPPRESS)
     parser.add_argument(
-        "--worlds", nargs="+", metavar="NAME", help=f"of {', '.join((*WORLDS, *SETS))} (all that are there)"
+        "--worlds",
+        nargs="+",
+        metavar="NAME",
+        help=f"of {', '.join((*WORLDS, *SETS, *(file.stem for file in surveys.files())))} (all that are there)",
     )
     parser.add_argument("--peers", nargs="+", metavar="NAME", help=f"parts of names of {', '.join(PEERS)}")
     parser.add_argument("--places", type=int, default=20, help="queries of each world (20)")
@@ -397,10 +448,11 @@ def rows(asked: Namespace) -> Iterator[Row]:
     if asked.trial:
         yield from _asked(asked.trial[0], asked.trial[1], asked.trial[2], asked.limit)
         return
-    there = [*WORLDS, *(name for name in SETS if (asked.data / name).exists())]
-    scenes = {name: ground_of(name, asked.data) for name in asked.worlds or (there[-1:] if asked.quick else there)}
+    real = [name for name in SETS if (asked.data / name).exists()]
+    there = [*WORLDS, *real, *(file.stem for file in surveys.files())]
+    scenes = asked.worlds or ([*WORLDS, *real][-1:] if asked.quick else there)
     peers = [name for name in PEERS if name == OURS or any(part in name for part in asked.peers or [""])]
-    trials = list(contest(peers, scenes, 4 if asked.quick else asked.places, asked.limit))
+    trials = list(contest(peers, scenes, asked.data, 4 if asked.quick else asked.places, asked.limit))
     reference = [trial for trial in trials if trial.peer == OURS]
     for peer in peers:
         theirs = [trial for trial in trials if trial.peer == peer]
