@@ -169,7 +169,7 @@ class GlobalSearch:
                 )
                 leader, undecided = modes.best, modes.undecided
                 if not undecided:
-                    scored = scored.beside(self._registered_rivals(reading, leader))
+                    scored = scored.beside(self._registered_rivals(replace(reading, scored=scored), leader))
             if scored.error < 0.5:  # a stated error has to be true even if nothing follows from it
                 scans = [scan] if reading.leans else [*self._scorer.scans[:-1], scan]
                 scored = scored.doubted(find_moved_part(self.base_map.field, scans, leader.T_map_odom))
@@ -197,18 +197,22 @@ class GlobalSearch:
         for k in [k for k in order if new(scored.places[k].T_map_odom)][:_GUESSES]:
             place, widest = scored.places[k], self.config.registration.search[0]
             found = register_place(place, scan, self.base_map, self.config, self._local_maps, widest=widest)
-            if new((found or place).T_map_odom) and len(rivals) < _NAMED:
+            if new((found or place).T_map_odom):
                 taken.append((found or place).T_map_odom)
                 rivals.append(k)
+            if len(rivals) == _NAMED:
+                break
         if not rivals:
             return []
-        ranks, right = reading.scorer.followed.votes, max(1.0 - scored.error, 1e-9)
+        votes, right = reading.scorer.followed.votes, max(1.0 - scored.error, 1e-9)
+        ranks = [int(votes[k if k < len(votes) else 0]) for k in rivals]  # the leader's where no vote has named a place
         out = reading.scorer.at_their_best(leader.T_map_odom, np.array(taken[2:]), scan)
-        self._named = [*((place, int(ranks[0])) for place in out if place.probability > 0.0), *self._named]
+        known = [(place, rank) for place, rank in zip(out, ranks, strict=True) if place.probability > 0.0]
+        self._named = [*known, *self._named]
         gains = []
-        for k, place in zip(rivals, out, strict=True):  # a rank that is better than the leader's counts
-            prior = max(1.0, (1.0 + ranks[0]) / (1.0 + ranks[k])) if k < len(ranks) else 1.0
-            gain = prior * place.probability - scored.places[k].probability / right
+        for k, rank, place in zip(rivals, ranks, out, strict=True):
+            odds = (1.0 + votes[0]) / (1.0 + rank) * place.probability
+            gain = odds - scored.places[k].probability / right
             gains.append(replace(place, probability=max(0.0, float(gain))))
         return gains
 
