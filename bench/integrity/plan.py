@@ -16,7 +16,7 @@ Group = Literal["calibration", "reported", "surveys", "runs"]
 Class = Literal["ordinary", "outside", "near copies", "gap", "real run"]
 
 LIDARS = ("vlp16", "mid360", "os64")
-FIRST_SEED = {"calibration": 41_000, "reported": 261_000, "surveys": 361_000}  # new after a run has changed the product
+FIRST_SEED = {"calibration": 41_000, "reported": 261_000, "surveys": 401_000}  # new after a run has changed the product
 STATED = (1e-1, 1e-2, 1e-3, 1e-4)
 """Stated errors; the first keyframe of a run below each counts, accepted or not."""
 
