@@ -383,8 +383,8 @@ def _made_by(name: str) -> str:
         file = ROOT / f"{module.replace('.', '/')}.py"
         if file.is_file() and file not in files:
             files.append(file)
-            for name in _imported(file.read_bytes()):
-                add(name)
+            for imported in _imported(file.read_bytes()):
+                add(imported)
 
     add(f"bench.{BENCHMARKS[TABLES[name].command.split()[0]].module}")
     return f"code {_code()}, bench {fingerprint(*sorted(str(file.relative_to(ROOT)) for file in files))}"

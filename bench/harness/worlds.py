@@ -117,9 +117,10 @@ def _place(run: Run, truth: Floats, start: int, site: BaseMap, keyframes: int) -
         keyframe = buffer.add(RawScan(voxelized(frame.points, T_odom_body, buffer.config), T_odom_body), frame.stamp)
         if keyframe is not None:
             queries.append(SearchRequest.of(buffer, keyframe, frame.points, RequestSpec(site.descriptor_config)))
+            last, T_odom_last = index, T_odom_body
         if len(queries) == keyframes:
             break
     position = queries[-1].position
     submap = (buffer.recent(keyframes) - position.astype(np.float32)).astype(np.float32)
-    T_submap_body = pose_from(T_odom_body[:3, :3], np.zeros(3))
-    return Place(queries, submap, to_local(truth[index], site.origin) @ inverse(T_submap_body))
+    T_submap_body = pose_from(T_odom_last[:3, :3], np.zeros(3))
+    return Place(queries, submap, to_local(truth[last], site.origin) @ inverse(T_submap_body))

@@ -26,7 +26,7 @@ from bench.harness.files import built, folder, remembered, trajectory
 from bench.harness.rows import Row, informs, judged, table
 from bench.integrity.integrity import Tally, code_of_runs, percent, planned, with_data
 from bench.integrity.plan import FAMILIES, Run
-from bench.integrity.run import Result, cloud_of, drive_of
+from bench.integrity.run import LENGTH, SPEED, Result, cloud_of, drive_of
 from bench.integrity.run import judged as outcome
 from coview_stream.clouds import read_tum, write_cloud, write_tum
 from coview_stream.errors import InputError
@@ -40,13 +40,16 @@ def name_of(run: Run) -> str:
     return f"{run.kind}-{run.seed}-{run.number}"
 
 
-def make(run: Run, below: Path) -> bool:
-    """Write the map, the run and the truth unless this code has; return whether the run exists."""
+def make(run: Run, below: Path, length: float = LENGTH, speed: float = SPEED) -> bool:
+    """Write the map, the run and the truth unless this code has; return whether the run exists.
+
+    The robot drives ``length`` metres at ``speed`` metres per second.
+    """
     out = below / name_of(run)
 
     def work() -> dict[str, bool]:
         shutil.rmtree(out, ignore_errors=True)
-        if (drive := drive_of(run)) is None:
+        if (drive := drive_of(run, length, speed)) is None:
             return {"exists": False}
         (out / "run" / "frames").mkdir(parents=True)
         write_cloud(out / "map.laz", cloud_of(run))
@@ -57,7 +60,7 @@ def make(run: Run, below: Path) -> bool:
         write_tum(out / "truth.tum", *(nowhere if drive.truth is None else (drive.stamps, drive.truth)))
         return {"exists": True}
 
-    return bool(remembered(out / "made.json", _spec(run), work)["exists"])
+    return bool(remembered(out / "made.json", {**_spec(run), "length": length, "speed": speed}, work)["exists"])
 
 
 def _spec(run: Run) -> dict[str, object]:

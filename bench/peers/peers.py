@@ -1,7 +1,6 @@
-"""Other libraries on the same queries, in simulated worlds, real runs and worlds of real surveys.
+"""Other libraries on the same queries: robots switched on eight metres ago, in simulated worlds, real runs and surveys.
 
-A robot was switched on eight metres ago. A survey's world is made of its other half (:mod:`bench.integrity.surveys`).
-
+Of a survey of ``COVIEW_DATA`` one half of the points is the map, and the world is made of the other.
 Each is asked twice: with the submap of the five keyframes since then, and with one scan alone. A trial ends after
 ``--limit`` seconds, so a slow peer answers the first queries only, and the shares of both sides are of those. Extra
 ``peers``; a peer that is missing gets a line with the remedy. ``--data`` has the real runs.
@@ -26,28 +25,24 @@ import numpy as np
 
 import coview_kernels
 from bench.__main__ import run
-from bench.accuracy.conditions import SETS
+from bench.accuracy.conditions import SETS, RealSet
 from bench.harness.files import add_data, built, fingerprint, folder, isolated, peak_megabytes, remembered
 from bench.harness.rows import Row, bounded, failed, informs, listed
 from bench.harness.worlds import KEYFRAMES, WORLDS, Place, map_of, places, prepare
 from bench.integrity import surveys
-from bench.integrity.plan import Run as Planned
-from bench.integrity.plan import plan
-from bench.integrity.run import Drive, drive_of
-from bench.integrity.run import map_of as map_of_run
+from bench.integrity.challenge import make, name_of
+from bench.integrity.integrity import code_of_runs, with_data
+from bench.integrity.plan import Run as Drive
 from bench.speed.registration import SmallGicp
 from coview_stream import BaseMap
 from coview_stream.clouds import read_tum
-from coview_stream.clouds.cloud import Cloud
 from coview_stream.config import LocalizerConfig
-from coview_stream.errors import CoViewError, require_library
+from coview_stream.errors import CoViewError, InputError, require_library
 from coview_stream.geometry.arrays import Floats
 from coview_stream.geometry.transforms import Points, Pose, inverse, pose_from
 from coview_stream.localization.registration.clouds import LocalMaps
 from coview_stream.localization.search.global_search import GlobalSearch
-from coview_stream.odometry.deskew import SweepCorrection
 from coview_stream.recordings.open_run import open_run
-from coview_stream.recordings.run import Run as Recorded
 from coview_stream.sim.casting import open3d
 
 
@@ -88,7 +83,7 @@ class KissMatcher:
     """KISS-Matcher 1.0 (MIT): FasterPFH, ROBIN pruning, GNC; the submap against the whole map.
 
     Of voxels of 0.7 to 2 m, with its default solver and with Quatro, the pair that was right most often on six places
-    of either world; the rest by default. It vouches by its own example's rule: a valid solution with five inliers.
+    of town and campus; the rest by default. It vouches by its own example's rule: a valid solution with five inliers.
     """
 
     VOXEL, INLIERS = 1.0, 5
@@ -344,72 +339,50 @@ def _asked(name: str, map_file: str, places_file: str, limit_s: float) -> Iterat
 
 
 QUERIES = {"": KEYFRAMES, ", one scan": 1}  # suffix of the world's name, and keyframes of a query
+SURVEYS = [file.stem for file in surveys.files()]
+FIRST_SEED = 501_000  # of squares of surveys
+PARTS = ("bench/harness/worlds.py", "bench/integrity/challenge.py", "bench/speed/registration.py")
 
 
-@dataclass(frozen=True)
-class DriveClouds:
-    """The clouds of a drive in a survey's world."""
-
-    drive: Drive
-
-    def read(self, index: int, correction: SweepCorrection | None = None) -> Cloud:
-        """Return cloud ``index``, body frame, metres."""
-        return Cloud(self.drive.frame(index), np.zeros(3))
-
-
-def on_surveys() -> dict[str, Planned]:
-    """Return a drive on a map of each survey by its name: the first of the plan of ``integrity`` that has a way."""
-    found = dict[str, Planned]()
-    for first in (site[0] for site in plan("surveys", 400) if site[0].family == "survey"):
-        name = surveys.place_of(first.seed).stem
-        if name not in found and drive_of(first) is not None:
-            found[name] = first
-        if len(found) == len(surveys.files()):
-            break
-    return found
-
-
-def ground_of(scene: str, data: Path) -> Path:
-    """Return the map of a simulated world, a survey or a real set, made if needed."""
+def ground_of(scene: str, data: Path) -> tuple[Path, Path]:
+    """Return the map of a world, survey or real set, and the folder of its ``run`` and truth, made if needed."""
     if scene in WORLDS:
-        prepare(folder(), WORLDS[scene])
-        return map_of(folder(), WORLDS[scene])
-    if scene in SETS:
-        return built(data / scene / "base.laz", folder() / "conditions" / "maps" / f"{scene}.coview")
-    site = folder() / "peers" / f"{scene}.coview"
-    made = {"code": fingerprint(), "bench": fingerprint("bench/integrity")}
-    site.parent.mkdir(parents=True, exist_ok=True)
-    remembered(site.with_suffix(".json"), made, lambda: map_of_run(on_surveys()[scene]).save(site))
-    return site
+        return map_of(folder(), WORLDS[scene]), prepare(folder(), WORLDS[scene])
+    if scene in SURVEYS:
+        return on_survey(scene)
+    real = RealSet(data / scene)
+    return built(real.survey, folder() / "conditions" / "maps" / f"{scene}.coview"), real.folder
 
 
-def _asked_of(scene: str, data: Path, site: Path, count: int, keyframes: int) -> list[Place]:
-    if scene in (*WORLDS, *SETS):
-        world = prepare(folder(), WORLDS[scene]) if scene in WORLDS else data / scene
-        run, truth = open_run(world / "run"), read_tum(world / "truth.tum")[1]
-    else:
-        drive = drive_of(on_surveys()[scene])
-        assert drive is not None
-        assert drive.truth is not None
-        at = (Path(scene),) * len(drive)
-        run, truth = Recorded(Path(scene), at, drive.stamps, drive.odometry, DriveClouds(drive)), drive.truth
+def on_survey(name: str) -> tuple[Path, Path]:
+    """Return the map and the folder of the first drive on a survey; InputError if no square of it has a way."""
+    below = folder() / "peers"
+    for seed in range(FIRST_SEED, FIRST_SEED + 100):
+        drive = Drive("surveys", "survey", "survey", seed, 0, "os64")
+        if surveys.place_of(seed).stem == name and make(drive, below, WORLDS["town"].length, WORLDS["town"].speed):
+            world = below / name_of(drive)
+            return built(world / "map.laz", world / "site.coview"), world
+    raise InputError(f"no square of {name} has a way to drive")
+
+
+def _asked_of(site: Path, world: Path, count: int, keyframes: int) -> list[Place]:
+    run, truth = open_run(world / "run"), read_tum(world / "truth.tum")[1]
     return places(BaseMap.load(site), run, truth, count, keyframes)
 
 
-def contest(peers: Sequence[str], scenes: Sequence[str], data: Path, count: int, limit_s: float) -> Iterator[Trial]:
+def contest(peers: Sequence[str], scenes: dict[str, tuple[Path, Path]], count: int, limit_s: float) -> Iterator[Trial]:
     """Yield a trial per world, query and peer; ``count`` places per world, ``limit_s`` seconds for each trial."""
-    code = {"code": fingerprint(), "bench": fingerprint("bench/peers", "bench/harness/worlds.py", "bench/integrity")}
+    code = with_data(code_of_runs()) | {"bench": fingerprint("bench/peers", *PARTS)}
     with tempfile.TemporaryDirectory() as scratch:
-        for scene in scenes:
-            site = isolated(ground_of, scene, data)
+        for scene, (site, world) in scenes.items():
             for suffix, keyframes in QUERIES.items():
                 file = Path(scratch) / f"{scene}{suffix}"
 
-                def make(peer: str, name: str, scene: str = scene, site: Path = site, file: Path = file,
+                def make(peer: str, name: str, site: Path = site, world: Path = world, file: Path = file,
                          keyframes: int = keyframes) -> dict[str, Any]:  # fmt: skip
                     print(f"... {peer}, {name}", file=sys.stderr, flush=True)
                     if not file.is_file():
-                        file.write_bytes(pickle.dumps(isolated(_asked_of, scene, data, site, count, keyframes)))
+                        file.write_bytes(pickle.dumps(isolated(_asked_of, site, world, count, keyframes)))
                     trial = run_trial(peer, name, count, site, file, limit_s)
                     if trial.answers:
                         return asdict(trial)
@@ -433,10 +406,7 @@ def options(parser: ArgumentParser) -> None:
     add_data(parser)
     parser.add_argument("--trial", nargs=3, help=SUPPRESS)
     parser.add_argument(
-        "--worlds",
-        nargs="+",
-        metavar="NAME",
-        help=f"of {', '.join((*WORLDS, *SETS, *(file.stem for file in surveys.files())))} (all that are there)",
+        "--worlds", nargs="+", metavar="NAME", help=f"of {', '.join((*WORLDS, *SETS, *SURVEYS))} (all that are there)"
     )
     parser.add_argument("--peers", nargs="+", metavar="NAME", help=f"parts of names of {', '.join(PEERS)}")
     parser.add_argument("--places", type=int, default=20, help="queries of each world (20)")
@@ -448,11 +418,10 @@ def rows(asked: Namespace) -> Iterator[Row]:
     if asked.trial:
         yield from _asked(asked.trial[0], asked.trial[1], asked.trial[2], asked.limit)
         return
-    real = [name for name in SETS if (asked.data / name).exists()]
-    there = [*WORLDS, *real, *(file.stem for file in surveys.files())]
-    scenes = asked.worlds or ([*WORLDS, *real][-1:] if asked.quick else there)
+    there = [*WORLDS, *SURVEYS, *(name for name in SETS if (asked.data / name).exists())]
+    scenes = {name: ground_of(name, asked.data) for name in asked.worlds or (there[-1:] if asked.quick else there)}
     peers = [name for name in PEERS if name == OURS or any(part in name for part in asked.peers or [""])]
-    trials = list(contest(peers, scenes, asked.data, 4 if asked.quick else asked.places, asked.limit))
+    trials = list(contest(peers, scenes, 4 if asked.quick else asked.places, asked.limit))
     reference = [trial for trial in trials if trial.peer == OURS]
     for peer in peers:
         theirs = [trial for trial in trials if trial.peer == peer]

@@ -27,7 +27,7 @@ from coview_stream.localization.search.scoring import PlaceScorer
 
 _ORDINARY = 20_000  # stations up to which the configured number of co-view hypotheses is enough
 _GUESSES = 12  # poses of a guess tried per keyframe
-_NAMED = 4  # places like the leader that the next keyframe looks at as well
+_NAMED = 4  # places like the leader, and rivals, that are looked at more closely, and by the next keyframe
 _STREET = 12.0  # metres from the leader: reach of the farthest hypothesis around it after its largest move
 
 
@@ -120,7 +120,7 @@ class GlobalSearch:
         self._guesses = HintSchedule()
         self._scorer.clear()
         self._keyframes = 0
-        self._named: list[tuple[Hypothesis, int]] = []  # places like the leader, with its rank in the votes
+        self._named: list[tuple[Hypothesis, int]] = []  # places for the next keyframe, each with its rank in the votes
 
     def reset(self) -> None:
         """Forget all votes and observations, and the newest descriptors."""
@@ -189,11 +189,13 @@ class GlobalSearch:
         """
         request, scan, scored = reading.request, reading.scan, reading.scored
         taken, rivals = [leader.T_map_odom, scored.places[0].T_map_odom], list[int]()
+        votes, count = reading.scorer.followed.votes, len(scored.places)
+        ranks = np.concatenate([votes, np.full(count - len(votes), votes[0])])  # only the map names the last places
 
         def new(T_map_odom: Pose) -> bool:
             return not any(same_place(T_map_odom, T, request, BASIN_DISTANCE, BASIN_ANGLE) for T in taken)
 
-        order = sorted(range(len(scored.places)), key=lambda k: -scored.places[k].ratio)
+        order = np.argsort(np.log1p(ranks) - [place.ratio for place in scored.places], kind="stable").tolist()
         for k in [k for k in order if new(scored.places[k].T_map_odom)][:_GUESSES]:
             place, widest = scored.places[k], self.config.registration.search[0]
             found = register_place(place, scan, self.base_map, self.config, self._local_maps, widest=widest)
@@ -204,17 +206,13 @@ class GlobalSearch:
                 break
         if not rivals:
             return []
-        votes, right = reading.scorer.followed.votes, max(1.0 - scored.error, 1e-9)
-        ranks = [int(votes[k if k < len(votes) else 0]) for k in rivals]  # the leader's where no vote has named a place
-        out = reading.scorer.at_their_best(leader.T_map_odom, np.array(taken[2:]), scan)
-        known = [(place, rank) for place, rank in zip(out, ranks, strict=True) if place.probability > 0.0]
-        self._named = [*known, *self._named]
-        gains = []
-        for k, rank, place in zip(rivals, ranks, out, strict=True):
-            odds = (1.0 + votes[0]) / (1.0 + rank) * place.probability
-            gain = odds - scored.places[k].probability / right
-            gains.append(replace(place, probability=max(0.0, float(gain))))
-        return gains
+        own = ranks[rivals]
+        out = reading.scorer.at_their_best(leader.T_map_odom, np.array(taken[2:]), own, scan)
+        known = zip(out, own.tolist(), strict=True)
+        self._named = [*((place, rank) for place, rank in known if place.probability > 0.0), *self._named]
+        before = np.array([scored.places[k].probability for k in rivals]) / max(1.0 - scored.error, 1e-9)
+        gains = np.maximum([place.probability for place in out] - before, 0.0)
+        return [replace(place, probability=gain) for place, gain in zip(out, gains.tolist(), strict=True)]
 
     def _alike(self, reading: Reading) -> list[Hypothesis]:
         """Return places that look like a probable leader's on the map, with their odds against it.

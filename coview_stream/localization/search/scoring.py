@@ -201,11 +201,12 @@ class PlaceScorer:
         ]  # fmt: skip
         return self._against_leader(part, new, scan) if new else []
 
-    def at_their_best(self, leader: Pose, T_map_odom: Floats, scan: ObservedScan) -> list[Hypothesis]:
+    def at_their_best(self, leader: Pose, T_map_odom: Floats, votes: Ints, scan: ObservedScan) -> list[Hypothesis]:
         """Return H other places with their odds against the leader, by registered poses (4, 4) and (H, 4, 4).
 
         Each, and the leader, is moved to the pose, of 25 around it, that the newest keyframe's evidence prefers: half a
-        metre may change the evidence more than a copy. Zero odds if a place is moved to the leader.
+        metre may change the evidence more than a copy. ``votes`` (H,) are the places' ranks in their votes. Zero odds
+        if a place is moved to the leader.
         """
         poses, layers = scan.poses(np.stack([leader, *T_map_odom])), self._base_map.field
         grid = (poses[:, None] + _AT_BEST).reshape(-1, 4)
@@ -214,15 +215,17 @@ class PlaceScorer:
         ratios = log_likelihood_ratios(shares, self._background).reshape(len(poses), -1)
         best = ratios.argmax(axis=1) + len(_AT_BEST) * np.arange(len(poses))
         aside = apart(part.poses[best[1:]], part.poses[best[0]], BASIN_DISTANCE, BASIN_ANGLE)
-        out = self._against_leader(part, best.tolist(), scan, first=1)
+        first = self._followed.votes[:1]
+        out = self._against_leader(part, best.tolist(), scan, np.log1p(np.append(first, votes)) - np.log1p(first))[1:]
         return [place if other else replace(place, probability=0.0) for place, other in zip(out, aside, strict=True)]
 
     def _against_leader(
-        self, part: Observations, new: list[int], scan: ObservedScan, first: int = 0
+        self, part: Observations, new: list[int], scan: ObservedScan, behind: Floats | None = None
     ) -> list[Hypothesis]:
-        """Return places at the rows ``new`` of observed poses, from ``first`` on, with their odds against the leader.
+        """Return places at the rows ``new`` of observed poses, with their odds against the leader by all keyframes.
 
-        The rows before ``first`` are further poses of the leader. The odds are by all keyframes.
+        ``behind`` are log-odds of the leader's prior against theirs, even by default; with them the first row is a
+        further pose of the leader.
         """
         layers, scans = self._base_map.field, self._scans
         at = scan.transforms(part.poses[new])
@@ -235,16 +238,18 @@ class PlaceScorer:
             poses = np.concatenate([poses, part.poses[new][:, None]], axis=1)
             found = Paths.of(layers, scans, poses, each).settled(self._background)
             aside = None
-            if first:  # shifts of a rival that lead to the leader are no evidence for the rival
+            if behind is not None:  # shifts of a rival that lead to the leader are no evidence for the rival
                 aside = apart(found.shifted.reshape(-1, 4), part.poses[new[0]], _ASIDE, BASIN_ANGLE)
                 aside = aside.reshape(found.table.shape)
-                aside[:first] = True
+                aside[0] = True
             ratios = np.maximum(ratios, found.ratios(aside))
         leader, variance = self._leader
-        leader = np.maximum(leader, ratios[:first].max(initial=-np.inf))
-        odds = odds_of(leader - ratios, variance + self._left * ratio_variances(observed, self._background))
+        gaps = leader - ratios
+        if behind is not None:
+            gaps = np.maximum(leader, ratios[0]) - ratios + behind
+        odds = odds_of(gaps, variance + self._left * ratio_variances(observed, self._background))
         rows = zip(at, part.scores[new].tolist(), ratios.tolist(), odds.tolist(), strict=True)
-        return [Hypothesis(T, score=score, ratio=ratio, probability=each) for T, score, ratio, each in rows][first:]
+        return [Hypothesis(T, score=score, ratio=ratio, probability=each) for T, score, ratio, each in rows]
 
     def beside(self, T_map_odom: Floats) -> Floats:
         """Return log-likelihood ratios (M,) of poses (M, 4, 4) beside the most probable place.

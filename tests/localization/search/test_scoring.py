@@ -208,7 +208,9 @@ def test_rivals_are_compared_at_their_best_pose(scorer, scan):
     leader = scored(scorer, some_places(scan), scan).places[0]
     beside, elsewhere = leader.T_map_odom.copy(), off(-20.0, 5.0, 70.0, scan)
     beside[:2, 3] += 0.5, -0.5
-    moved, wrong = scorer.at_their_best(elsewhere, np.array([beside, off(20.0, 5.0, 70.0, scan)]), scan)
+    moved, wrong = scorer.at_their_best(
+        elsewhere, np.array([beside, off(20.0, 5.0, 70.0, scan)]), np.zeros(2, int), scan
+    )
     ratio = scorer.beside(beside[None])[0]
     assert moved.ratio > ratio + 5.0
     assert moved.probability > 0.3
