@@ -22,7 +22,7 @@ from typing import Any
 
 import numpy as np
 
-from bench.harness.files import built, folder, remembered, trajectory
+from bench.harness.files import built, fingerprint, folder, remembered, trajectory
 from bench.harness.rows import Row, informs, judged, table
 from bench.integrity.integrity import Tally, code_of_runs, percent, planned, with_data
 from bench.integrity.plan import FAMILIES, Run
@@ -64,7 +64,7 @@ def make(run: Run, below: Path, length: float = LENGTH, speed: float = SPEED) ->
 
 
 def _spec(run: Run) -> dict[str, object]:
-    return with_data(code_of_runs()) | {"run": asdict(run)}
+    return with_data(code_of_runs()) | {"product": fingerprint(), "run": asdict(run)}
 
 
 def score(answer: Path, truth: Path) -> dict[str, Any]:

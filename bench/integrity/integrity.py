@@ -17,6 +17,8 @@ data is refused.
 
 from __future__ import annotations
 
+import ast
+import functools
 import json
 import lzma
 import math
@@ -30,7 +32,8 @@ from pathlib import Path
 
 import numpy as np
 
-from bench.harness.files import data, fingerprint, folder, locked
+import coview_stream
+from bench.harness.files import ROOT, data, fingerprint, folder, locked
 from bench.harness.rows import NOTHING, Row, informs, interval, judged, number, table, upper
 from bench.integrity.plan import FAMILIES, STATED, Site, plan, real_runs
 from bench.integrity.run import Result, before, everywhere
@@ -226,9 +229,33 @@ def rows(asked: Namespace) -> Iterator[Row]:
 
 
 def code_of_runs() -> str:
-    """Return the hash of the code that results depend on, without that of the tables."""
-    parts = (f"bench/integrity/{name}.py" for name in ("run", "plan", "sites", "kinds", "made_up", "surveys"))
-    return f"{fingerprint()}-{fingerprint(*parts, 'bench/tracking/worlds.py')}"
+    """Return the hash of the code that a run executes; a change of the commands, the node or the tables keeps it."""
+    return fingerprint(*parts_of_runs())
+
+
+@functools.cache
+def parts_of_runs() -> tuple[str, ...]:
+    """Return the files that runs depend on: of ``bench``, what they import at any depth, all kernels and weights."""
+    below = Path(coview_stream.__path__[0]).parent
+    names = ("run", "plan", "sites", "kinds", "made_up", "surveys")
+    left = [*(ROOT / f"bench/integrity/{name}.py" for name in names), ROOT / "bench/tracking/worlds.py"]
+    found = {file: str(file.relative_to(ROOT)) for file in left}
+
+    def add(module: str) -> None:
+        path = below / module.replace(".", "/")
+        for file in (path.with_suffix(".py"), path / "__init__.py"):
+            if module.startswith("coview_stream.") and file.is_file() and file not in found:
+                found[file] = str(file.relative_to(below))
+                left.append(file)
+
+    while left:
+        for node in ast.walk(ast.parse(left.pop().read_bytes())):
+            if isinstance(node, ast.ImportFrom) and node.module:
+                add(node.module)
+                for alias in node.names:
+                    home = coview_stream._HOMES.get(alias.name) if node.module == "coview_stream" else None
+                    add(f"{node.module}.{home or alias.name}")
+    return ("coview_kernels", "coview_stream/descriptors/weights", *sorted(found.values()))
 
 
 _FOUND = (

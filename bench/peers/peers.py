@@ -372,7 +372,7 @@ def _asked_of(site: Path, world: Path, count: int, keyframes: int) -> list[Place
 
 def contest(peers: Sequence[str], scenes: dict[str, tuple[Path, Path]], count: int, limit_s: float) -> Iterator[Trial]:
     """Yield a trial per world, query and peer; ``count`` places per world, ``limit_s`` seconds for each trial."""
-    code = with_data(code_of_runs()) | {"bench": fingerprint("bench/peers", *PARTS)}
+    code = with_data(code_of_runs()) | {"product": fingerprint(), "bench": fingerprint("bench/peers", *PARTS)}
     with tempfile.TemporaryDirectory() as scratch:
         for scene, (site, world) in scenes.items():
             for suffix, keyframes in QUERIES.items():

@@ -39,7 +39,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    """Localize and write; exit code 1 if no frame was localized."""
+    """Localize and write; exit code 1 if no frame was localized, or a fault says that no pose is to be trusted."""
     from coview_stream.basemap.basemap import BaseMap
     from coview_stream.clouds.progress import progress_bar
     from coview_stream.config import LocalizerConfig
@@ -95,7 +95,7 @@ def run(args: argparse.Namespace) -> int:
     print(f"{'written':<18} {args.output}: {', '.join(written)}")
     if not located.posed or located.faults:
         print(f"why, and what to do: {asked}")
-    return 0 if located.posed else 1
+    return 0 if located.trusted else 1
 
 
 def _doctor_command(args: argparse.Namespace) -> str:

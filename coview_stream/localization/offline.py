@@ -140,6 +140,12 @@ class RunResult:
         return [fix for fix in self.fixes if fix.T_map_body is not None]
 
     @property
+    def trusted(self) -> bool:
+        """Whether there are poses, and one is later than all that contradicts the input's conventions."""
+        told = self.faults.get(RejectionReason.CONVENTIONS)
+        return bool(self.posed) and (told is None or self.posed[-1].stamp >= told.last)
+
+    @property
     def filtered(self) -> tuple[Floats, Poses]:
         """Stamps (P,) and live poses (P, 4, 4) map <- body, of the frames that had one."""
         return _trajectory(self.posed)
@@ -394,7 +400,7 @@ def summary(located: RunResult) -> str:
     begin = located.fixes[0].stamp if located.fixes else 0.0
     for cause, told in located.faults.items():
         span = f"{counted(told.frames, 'frame')} from {told.first - begin:.1f} s to {told.last - begin:.1f} s"
-        never_mended = cause is RejectionReason.CONVENTIONS and bool(posed) and posed[-1].stamp < told.last
+        never_mended = cause is RejectionReason.CONVENTIONS and bool(posed) and not located.trusted
         doubtful = "; poses before it are not to be trusted" * never_mended
         lines.append(f"{'FAULT ' + cause.value:<18} {span}: {told.reason}{doubtful}")
     if located.smoothed is not None and not posed:

@@ -261,3 +261,9 @@ def test_a_command_that_ends_in_a_traceback_has_failed_and_has_not_said_that_the
     monkeypatch.setattr(files, "command", command)
     with pytest.raises(InputError, match=": ValueError: x"):
         files.trajectory(tmp_path / "site.coview", tmp_path / "run", tmp_path)
+
+
+def test_runs_depend_on_what_they_execute_and_not_on_commands_or_nodes():
+    parts = integrity.parts_of_runs()
+    assert {"coview_kernels", "coview_stream/localization/search/scoring.py", "bench/integrity/run.py"} <= set(parts)
+    assert not [part for part in parts if part.split("/")[1:2] in (["cli"], ["doctor"], ["stream"], ["viewers"])]

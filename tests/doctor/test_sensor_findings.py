@@ -106,8 +106,12 @@ def test_beginning_of_a_long_run_on_no_map_is_told_as_such(in_feet):
 def test_fault_that_is_less_probable_than_none_fails_no_run(way, monkeypatch, probability):
     """Poses are withheld at one in a thousand; of many frames one reaches that by chance."""
     told = iter([None] * 5 + [("mixed", "clouds do not fit each other", probability)])
-    judges = (lambda frame: next(told, None)), lambda: ("", Calibration())
+    judges = (lambda frame: next(told, None)), lambda: ("", Calibration(roll=0.02))
     monkeypatch.setattr(map_checks, "_judge", lambda *_: judges)
     run = run_of(way.clouds, way.T_odom_body)
-    (found, *_) = map_checks.sensor_findings(run, None, LocalizerConfig())
+    (found, *rest) = map_checks.sensor_findings(run, None, LocalizerConfig())
     assert (found.what, found.verdict) == ("sensors", "FAIL" if probability > 0.5 else "ok")
+    # without a map the ground may slope: no mount is advised
+    assert [(each.found.partition(":")[0], "--mount" in each.remedy) for each in rest] == (
+        [] if probability > 0.5 else [("sensor leans 1.1 deg in roll", False)]
+    )

@@ -192,6 +192,8 @@ def test_faults_of_sensors_are_reported_whether_there_are_poses_or_not(world_map
     assert re.search(rf"^FAULT conventions .*{distrust}$", summary(RunResult(6, [*found.fixes, axes])), re.MULTILINE)
     assert distrust not in summary(found)
     assert distrust not in summary(RunResult(6, [axes, fix(14.0, True)]))  # it went by
+    assert RunResult(6, [axes, fix(14.0, True)]).trusted
+    assert not any(RunResult(6, fixes).trusted for fixes in ([*found.fixes, axes], [axes], []))
     unposed = RunResult(2, found.fixes[1:3])
     assert "FAULT repeated" in summary(unposed)
     assert "FAULT" not in summary(RunResult(1, found.fixes[:1]))
