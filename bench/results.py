@@ -18,9 +18,7 @@ quick release has its page in DIR.
 
 from __future__ import annotations
 
-import ast
 import contextlib
-import functools
 import itertools
 import json
 import os
@@ -39,7 +37,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 from bench.__main__ import BENCHMARKS, BUSY, parser_of, tables_of
-from bench.harness.files import ROOT, commit, data, environment, fingerprint
+from bench.harness.files import ROOT, commit, data, environment, fingerprint, imported
 from bench.harness.rows import HEAD as COLUMNS
 from bench.harness.rows import Row, table
 from coview_stream.clouds.atomic_file import atomic_path
@@ -381,21 +379,10 @@ def _made_by(name: str) -> str:
 
     def add(module: str) -> None:
         file = ROOT / f"{module.replace('.', '/')}.py"
-        if file.is_file() and file not in files:
+        if module.startswith("bench.") and file.is_file() and file not in files:
             files.append(file)
-            for imported in _imported(file.read_bytes()):
-                add(imported)
+            for part in imported(file.read_bytes()):
+                add(part)
 
     add(f"bench.{BENCHMARKS[TABLES[name].command.split()[0]].module}")
     return f"code {_code()}, bench {fingerprint(*sorted(str(file.relative_to(ROOT)) for file in files))}"
-
-
-@functools.cache
-def _imported(source: bytes) -> tuple[str, ...]:
-    """Return what a module imports from ``bench``: modules, and names that may be modules."""
-    return tuple(
-        f"{node.module}{part}"
-        for node in ast.walk(ast.parse(source))
-        if isinstance(node, ast.ImportFrom) and (node.module or "").startswith("bench")
-        for part in ("", *(f".{alias.name}" for alias in node.names))
-    )

@@ -104,6 +104,17 @@ def code_of(content: bytes, suffix: str = ".py") -> bytes:
     return ast.unparse(_Prose().visit(ast.parse(content))).encode() if suffix == ".py" else content
 
 
+@functools.cache
+def imported(source: bytes) -> tuple[str, ...]:
+    """Return what a Python source imports from modules: their names, and those of what may be modules in them."""
+    return tuple(
+        f"{node.module}{part}"
+        for node in ast.walk(ast.parse(source))
+        if isinstance(node, ast.ImportFrom) and node.module
+        for part in ("", *(f".{alias.name}" for alias in node.names))
+    )
+
+
 class _Prose(ast.NodeTransformer):
     """Removes docstrings."""
 

@@ -17,7 +17,6 @@ data is refused.
 
 from __future__ import annotations
 
-import ast
 import functools
 import json
 import lzma
@@ -33,7 +32,7 @@ from pathlib import Path
 import numpy as np
 
 import coview_stream
-from bench.harness.files import ROOT, data, fingerprint, folder, locked
+from bench.harness.files import ROOT, data, fingerprint, folder, imported, locked
 from bench.harness.rows import NOTHING, Row, informs, interval, judged, number, table, upper
 from bench.integrity.plan import FAMILIES, STATED, Site, plan, real_runs
 from bench.integrity.run import Result, before, everywhere
@@ -235,7 +234,7 @@ def code_of_runs() -> str:
 
 @functools.cache
 def parts_of_runs() -> tuple[str, ...]:
-    """Return the files that runs depend on: of ``bench``, what they import at any depth, all kernels and weights."""
+    """Return the files that runs depend on: of ``bench``, of the package at any depth, all kernels and weights."""
     below = Path(coview_stream.__path__[0]).parent
     names = ("run", "plan", "sites", "kinds", "made_up", "surveys")
     left = [*(ROOT / f"bench/integrity/{name}.py" for name in names), ROOT / "bench/tracking/worlds.py"]
@@ -248,13 +247,10 @@ def parts_of_runs() -> tuple[str, ...]:
                 found[file] = str(file.relative_to(below))
                 left.append(file)
 
+    homes = {f"coview_stream.{name}": f"coview_stream.{home}" for name, home in coview_stream._HOMES.items()}
     while left:
-        for node in ast.walk(ast.parse(left.pop().read_bytes())):
-            if isinstance(node, ast.ImportFrom) and node.module:
-                add(node.module)
-                for alias in node.names:
-                    home = coview_stream._HOMES.get(alias.name) if node.module == "coview_stream" else None
-                    add(f"{node.module}.{home or alias.name}")
+        for name in imported(left.pop().read_bytes()):
+            add(homes.get(name, name))
     return ("coview_kernels", "coview_stream/descriptors/weights", *sorted(found.values()))
 
 
