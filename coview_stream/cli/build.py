@@ -101,6 +101,8 @@ def run(args: argparse.Namespace) -> int:
     from coview_stream.config import map_preset
     from coview_stream.errors import ConfigError, MapError
 
+    for path in map(Path, args.maps):
+        _refuse_frames(path)
     output = Path(args.output)
     if output.resolve() in [Path(name).resolve() for name in args.maps]:
         raise MapError(f"{output}: is one of the scans to read; give the map another name")
@@ -120,6 +122,23 @@ def run(args: argparse.Namespace) -> int:
         if tiles:
             return _build_site(clouds, args, output, map_preset(args.preset, **options), key)
         return _build_file(clouds, args, output, options, key)
+
+
+def _refuse_frames(path: Path) -> None:
+    """Raise MapError for our recorded run, or its directory of frames, which a map would put on top of each other.
+
+    Named files, patterns and other layouts are not checked.
+    """
+    from coview_stream.clouds.files import is_cloud_name
+    from coview_stream.errors import MapError
+
+    place = path.resolve()
+    frames = place if place.name == "frames" else place / "frames"
+    if not (frames.is_dir() and (frames.parent / "odometry.tum").is_file()):
+        return
+    if place == frames or not any(map(is_cloud_name, place.iterdir())):
+        fault = "holds the frames of a run, each in the frame of the body"
+        raise MapError(f"{path}: {fault}; name a scan of the site, or '{frames}/*' if they are in one frame")
 
 
 def _announce(clouds: Clouds, tiles: bool) -> None:

@@ -5,14 +5,19 @@ from __future__ import annotations
 import argparse
 import sys
 from dataclasses import replace
+from typing import TYPE_CHECKING
 
 from coview_stream.cli.options import KISS_ICP, add_network, add_shared, mount_of
+
+if TYPE_CHECKING:
+    from coview_stream.stream.transport.transport import Transport
 
 HELP = "feed a recorded run into zenoh as a live robot"
 
 _NO_ODOMETRY = "none"
 _LAST_WAIT = 0.5  # seconds, set by hand: a session learns of subscribers shortly after its first query
 _STARTS = 120.0  # seconds, the longest start of an engine: EngineProcess; the first start compiles kernels
+_NAMED = 5  # robots
 _MAX_SPACING = 0.4  # seconds, set by hand: 0.1 s of jitter below NodeConfig.odometry_timeout
 
 
@@ -106,7 +111,8 @@ def run(args: argparse.Namespace) -> int:
         with stop_on_signals() as stop:
             heard = transport.await_subscriber(sender.cloud_key, args.wait, stop.wait)
             if not heard and not stop.requested:
-                print(f"nothing subscribes to {sender.cloud_key} yet; sending all the same", file=sys.stderr)
+                others = _served(transport, args.base, args.robot)
+                print(f"nothing subscribes to {sender.cloud_key} yet{others}; sending all the same", file=sys.stderr)
             if heard and args.wait > 0 and not await_engines(transport, args.base, args.robot, _STARTS, stop.wait):
                 print("the node's engines are not ready yet; sending all the same", file=sys.stderr)
             total = None if args.loop else len(recorded)
@@ -119,3 +125,16 @@ def run(args: argparse.Namespace) -> int:
         transport.close()
     print(report.text())
     return 0 if report.heard else 1
+
+
+def _served(transport: Transport, base: str, robot: str) -> str:
+    """Return a clause on the robots that nodes name by liveliness tokens; empty if there are none."""
+    from coview_stream.errors import TransportError, printable
+
+    try:
+        names = sorted({token.split("/")[-2] for token in transport.tokens(f"{base}/*/alive")})
+    except TransportError:
+        names = []
+    if robot in names:
+        return ": a node serves the robot by other keys (--preset)"
+    return f": nodes serve {printable(', '.join(names[:_NAMED]))}{', ...' * (len(names) > _NAMED)}" * bool(names)

@@ -107,9 +107,9 @@ def frame_findings(
             yield _ground_finding(ground, robot, given)
         return
     seen = None if ground is None else fit(pairs)
-    explanation = _explanation(frames, ground, pairs, seen, robot, unit, given)
-    if explanation is not None:
-        yield explanation
+    explanations = _explanations(frames, ground, pairs, seen, robot, unit, given)
+    if explanations:
+        yield from explanations
         return
     if ground is None:
         remedy = "is z up, are points in metres, and are those on the ground sent too? `coview-stream help reasons`"
@@ -161,7 +161,7 @@ def _pairs(frames: Sequence[SeenFrame], ground: _Ground | None) -> tuple[list[Pa
     return [pair for pair in found if pair is not None], ""
 
 
-def _explanation(
+def _explanations(
     frames: Sequence[SeenFrame],
     ground: _Ground | None,
     pairs: Sequence[Pair],
@@ -169,23 +169,26 @@ def _explanation(
     robot: str | None,
     unit: float,
     given: Mount | None,
-) -> Finding | None:
-    """Return the mistake that explains why the lidar contradicts odometry; both where two explain it equally well.
+) -> list[Finding]:
+    """Return the mistakes that explain why the lidar contradicts odometry: more than one if they do so equally well.
 
-    ``unit`` is the clouds' unit in metres, which they have been multiplied by.
+    ``unit`` is the clouds' unit in metres, which they have been multiplied by. Probabilities are those among the tried
+    readings, "as sent" and "unrelated motions", all equally usual.
     """
     candidates: list[tuple[float, Finding]] = []
     sent = seen is not None and ground is not None and not ground.axis and unit == 1.0
-    as_sent = max(0.0, seen.odds) if sent and seen is not None else 0.0
+    as_sent = seen.odds if sent and seen is not None else 0.0
+    enough = max(0.0, as_sent) + SURE
+
+    def explained() -> bool:
+        return any(odds > enough for odds, _ in candidates)
 
     def consider(reading: Reading, finding: Finding | None = None) -> None:
         as_read = fit(pairs, reading)
-        if as_read.odds <= as_sent + SURE:
-            return
         if finding is None:
             found = f"{reading.found}: read so, it follows the lidar to {as_read.misfit:.2f} m"
             finding = Finding("FAIL", "axes and units", found, reading.remedy, robot)
-        candidates.append((as_read.odds, replace(finding, found=f"{finding.found} ({_surely(as_read)})")))
+        candidates.append((as_read.odds, finding))
 
     if ground is not None and seen is not None:
         R = rot_z(-seen.yaw) @ turning(ground.up, UP)
@@ -195,31 +198,35 @@ def _explanation(
         if unit != 1.0:
             consider(MILLIMETRES)
         for reading in (
-            () if candidates and unit != 1.0 else (BOTH_CAMERA,) if ground.axis else (MIRRORED, SWAPPED, *ODOMETRY)
+            () if explained() and unit != 1.0 else (BOTH_CAMERA,) if ground.axis else (MIRRORED, SWAPPED, *ODOMETRY)
         ):
             consider(reading)
-    if not candidates and as_sent <= SURE:
+    if not explained() and as_sent <= SURE:
         as_they_came = [replace(frame, points=frame.points / np.float32(unit)) for frame in frames]
         for reading, frames_of_body in _of_fixed_frames(as_they_came):
             ground = _ground(frames_of_body)
-            if not candidates and ground is not None and not ground.axis:
+            if not explained() and ground is not None and not ground.axis:
                 pairs = _pairs(frames_of_body, ground)[0]
                 consider(reading)
-    if not candidates and as_sent <= SURE:
+    if not explained() and as_sent <= SURE:
         scaled = [replace(frame, points=frame.points * np.float32(FOOT)) for frame in frames]
         ground = _ground(scaled)
         if ground is not None and not ground.axis:
             pairs = _pairs(scaled, ground)[0]
             consider(FEET)
+    if not explained():
+        return []
     candidates.sort(key=lambda candidate: -candidate[0])
-    if not candidates:
-        return None
-    odds, best = candidates[0]
-    if len(candidates) > 1 and odds - candidates[1][0] < SURE:  # as on a straight drive
-        other = candidates[1][1]
-        remedy = f"{best.remedy}; or else {other.remedy}: a drive with a curve tells which"
-        return replace(best, found=f"{best.found}; or else {other.found}", remedy=remedy)
-    return best
+    odds = np.array([*(odds for odds, _ in candidates), 0.0, as_sent])
+    shares = np.exp(odds - odds.max())
+    shares /= shares.sum()
+    told = [finding for each, finding in candidates if odds[0] - each < SURE]
+    if len(told) == 1:
+        return [replace(told[0], found=f"{told[0].found} (wrong {one_in(1.0 - shares[0])})")]
+    shown = [f"{each.found} ({share:.0%} probable)" for each, share in zip(told, shares, strict=False)]
+    first, *others = [replace(each, found=found) for each, found in zip(told, shown, strict=True)]
+    first = replace(first, remedy=f"{first.remedy}; bends or uneven ground may tell which")
+    return [first, *(replace(each, verdict="warn", found=f"or else {each.found}") for each in others)]
 
 
 _GUESSED = (

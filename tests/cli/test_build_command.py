@@ -5,6 +5,7 @@ import io
 import itertools
 import json
 import re
+import shutil
 import sys
 from types import SimpleNamespace
 
@@ -88,6 +89,20 @@ def test_bad_cloud_files_are_refused_and_the_old_map_stays(cloud, world_file, tm
         assert name in refused("build", cloud, tmp_path / name, "-o", target)
     assert sorted(tmp_path.iterdir()) == before
     assert target.read_bytes() == world_file.read_bytes()
+
+
+def test_frames_of_a_run_are_no_map(cloud, tmp_path, refused, monkeypatch):
+    frames = tmp_path / "run" / "frames"
+    frames.mkdir(parents=True)
+    shutil.copy(cloud, frames / "000000.ply")
+    output = tmp_path / "site.coview"
+    (tmp_path / "link").symlink_to(frames)
+    monkeypatch.chdir(frames)
+    for name in ("..", ".", "../frames/", tmp_path / "link", tmp_path / "run"):
+        (tmp_path / "run" / "odometry.tum").write_text("0 0 0 0 0 0 0 1\n")
+        assert "holds the frames of a run" in refused("build", name, "-o", output)
+        (tmp_path / "run" / "odometry.tum").unlink()
+        assert "holds the frames of a run" not in refused("build", name, "-o", tmp_path / "no" / "site.coview")
 
 
 def test_missing_output_directory_is_refused_before_building(tmp_path, refused):

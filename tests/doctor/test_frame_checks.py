@@ -104,6 +104,18 @@ def test_a_straight_drive_is_said_not_to_show_a_mirror(frames):
     assert "whether y points left" in motion.remedy
 
 
+@pytest.mark.slow
+def test_mistakes_that_a_straight_drive_cannot_tell_apart_are_each_named_with_their_remedy(frames):
+    spoil, words = FAULTS["clockwise"]
+    findings = list(frame_findings([spoil(f) for f in frames[:7]]))
+    assert [f.verdict for f in findings] == ["FAIL", "warn", "warn"]
+    assert words in findings[0].found
+    assert findings[0].remedy.endswith("bends or uneven ground may tell which")
+    assert all("(33% probable)" in f.found for f in findings)
+    assert all(f.found.startswith("or else ") for f in findings[1:])
+    assert len({f.remedy for f in findings}) == 3
+
+
 # this drive is nearly straight: there an inverse is told as a lidar that is turned on the body
 @pytest.mark.slow
 @pytest.mark.parametrize("fault", [fault for fault in FAULTS if fault != "inverse"])

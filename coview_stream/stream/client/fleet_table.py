@@ -28,6 +28,7 @@ _COLUMNS = (
     ("y", 13),
     ("z", 9),
     ("yaw deg", 8),
+    ("within m", 9),
     ("age s", 6),
     ("Hz", 5),
     ("wrong", 15),
@@ -117,10 +118,11 @@ def _row(view: RobotView, now: float) -> list[str]:
     if silence > SILENT:
         state = f"silent {silence:.0f} s"
     latency, counters = _mapping(view.status, "latency_ms"), _mapping(view.status, "counters")
-    cells, rate = ["-"] * 5, f"{view.pose_rate(now):.1f}"
+    cells, rate = ["-"] * 6, f"{view.pose_rate(now):.1f}"
     if pose is not None:
         cells = [f"{value:.2f}" for value in pose.T_map_body[:3, 3]]
-        cells += [f"{math.degrees(yaw_of(pose.T_map_body)):.1f}", _number(pose.age, 2)]
+        level = None if pose.protection is None else pose.protection.metres
+        cells += [f"{math.degrees(yaw_of(pose.T_map_body)):.1f}", _number(level, 2), _number(pose.age, 2)]
     says = _mapping(view.status, "calibration").get("says")  # the node's remarks on sensor and odometry
     reasons = [
         f"on map {view.status['map']}" if isinstance(view.status.get("map"), str) else "",

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from coview_stream.errors import MessageError, printable
+from coview_stream.geometry.protection import ProtectionLevel
 from coview_stream.geometry.transforms import pose_from, rot_z
 from coview_stream.messages import decode_pose, encode_pose
 from coview_stream.messages.json_messages import pose_record, read_status
@@ -15,7 +16,8 @@ from coview_stream.messages.types import PoseMessage, Sample
 from coview_stream.stream.client.fleet_table import MAX_ROBOTS, SILENT, STALE, FleetTable
 
 T = pose_from(rot_z(math.radians(30)), [412_000.123, 5_318_000.456, 7.891])
-POSE = PoseMessage(5, "r1", "TRACKING", T, np.eye(6), 0.93, "ab", 0.12)
+LEVEL = ProtectionLevel(0.347, 1.0, 0.2, 0.1)
+POSE = PoseMessage(5, "r1", "TRACKING", T, np.eye(6), 0.93, "ab", 0.12, protection=LEVEL)
 STATUS = {
     "state": "TRACKING",
     "reason": "all well",
@@ -37,8 +39,13 @@ def test_tracking_robot_shows_its_pose(fleet):
     assert header.split()[:6] == ["robot", "state", "x", "y", "z", "yaw"]
     assert line.split() == [
         *("r1", "TRACKING", "412000.12", "5318000.46", "7.89", "30.0"),
-        *("0.12", "10.0", "1", "in", "14", "31/89", "4", "all", "well"),
+        *("0.35", "0.12", "10.0", "1", "in", "14", "31/89", "4", "all", "well"),
     ]
+
+
+def test_pose_without_a_level_shows_none(fleet):
+    fleet.add_pose(replace(POSE, protection=None), 9.0)
+    assert fleet.table(9.1)[1].split()[5:8] == ["30.0", "-", "0.12"]
 
 
 def test_reason_stands_whole_below_its_robot_on_a_terminal(fleet):
