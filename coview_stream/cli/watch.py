@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING
 from coview_stream.cli.map_argument import local_map
 from coview_stream.cli.options import add_network, add_shared
 from coview_stream.cli.view import add_view
-from coview_stream.errors import ConfigError, MessageError
+from coview_stream.errors import ConfigError, MessageError, counted
 
 if TYPE_CHECKING:
     from coview_stream.cli.process import Stop
@@ -170,7 +170,7 @@ class _Watch:
 
         connection = self._transport.connection()
         count = len(connection.routers) + len(connection.peers)
-        connected = f"connected to {count} other(s)" if count else "not connected"
+        connected = f"connected to {counted(count, 'program')}" if count else "not connected"
         at = ", ".join(self._args.connect or self._args.listen or [str(self._args.zenoh_config or DEFAULT_ENDPOINT)])
         keys = ", ".join(topic.key for topic in self._topics)
         print(f"nothing yet on {keys}; {connected} ({at})", file=sys.stderr, flush=True)

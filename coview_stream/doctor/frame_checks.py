@@ -57,8 +57,14 @@ IN_ODOMETRY = Reading(
     "clouds are in odometry's frame: they were moved there already, as FAST-LIO's /cloud_registered are",
     "send them in the body's frame, as they are seen (/cloud_registered_body)",
 )
+_CENTIMETRE = 0.01  # metres
+CLOUDS_IN_CENTIMETRES = Reading("clouds are in centimetres", "send metres")
+ODOMETRY_IN_CENTIMETRES = Reading(
+    "odometry is in centimetres", "send metres", change=lambda T: pose_from(T[:3, :3], _CENTIMETRE * T[:3, 3])
+)
 IN_MAP = Reading("clouds are in a map's frame, and do not move with the robot", IN_ODOMETRY.remedy)
 _GROUND_FRAMES = 16
+_DRIVE = "drive ten metres past walls, poles or trunks, with a bend, and ask again"
 
 
 @dataclass(frozen=True)
@@ -87,7 +93,10 @@ def frame_findings(
     frames: Sequence[SeenFrame], robot: str | None = None, given: Mount | None = None
 ) -> Iterator[Finding]:
     """Judge frames in order, a metre or two apart, with their odometry; ``given``: mount already applied to them."""
-    if len(frames) < 2:
+    if not frames:
+        return
+    if len(frames) == 1:
+        yield Finding("warn", "motion", "one frame shows no motion: axes and units are not checked", _DRIVE, robot)
         return
     unit = float(np.median([unit_of(frame.points) for frame in frames]))
     if unit != 1.0:
@@ -103,7 +112,7 @@ def frame_findings(
     still = _still(frames, pairs, robot)
     if still is not None:
         yield still
-        if still.verdict == "ok" and ground is not None:
+        if still.verdict != "FAIL" and ground is not None:
             yield _ground_finding(ground, robot, given)
         return
     seen = None if ground is None else fit(pairs)
@@ -198,7 +207,11 @@ def _explanations(
         if unit != 1.0:
             consider(MILLIMETRES)
         for reading in (
-            () if explained() and unit != 1.0 else (BOTH_CAMERA,) if ground.axis else (MIRRORED, SWAPPED, *ODOMETRY)
+            ()
+            if explained() and unit != 1.0
+            else (BOTH_CAMERA,)
+            if ground.axis
+            else (MIRRORED, SWAPPED, *ODOMETRY, ODOMETRY_IN_CENTIMETRES)
         ):
             consider(reading)
     if not explained() and as_sent <= SURE:
@@ -209,11 +222,12 @@ def _explanations(
                 pairs = _pairs(frames_of_body, ground)[0]
                 consider(reading)
     if not explained() and as_sent <= SURE:
-        scaled = [replace(frame, points=frame.points * np.float32(FOOT)) for frame in frames]
-        ground = _ground(scaled)
-        if ground is not None and not ground.axis:
-            pairs = _pairs(scaled, ground)[0]
-            consider(FEET)
+        for reading, size in ((FEET, FOOT), (CLOUDS_IN_CENTIMETRES, _CENTIMETRE)):
+            scaled = [replace(frame, points=frame.points * np.float32(size / unit)) for frame in frames]
+            ground = _ground(scaled)
+            if ground is not None and not ground.axis:
+                pairs = _pairs(scaled, ground)[0]
+                consider(reading)
     if not explained():
         return []
     candidates.sort(key=lambda candidate: -candidate[0])
@@ -287,7 +301,7 @@ def _still(frames: Sequence[SeenFrame], pairs: Sequence[Pair], robot: str | None
         found = f"odometry stands still, but the lidar moves: {driven:.1f} m between frames, odometry {moved:.2f} m"
         return Finding("FAIL", "motion", found, "is odometry the identity, or not running? send it live", robot)
     found = f"the robot stands still ({moved:.2f} m): nothing can be said of its motion"
-    return Finding("ok", "motion", found, "drive ten metres and ask again", robot)
+    return Finding("warn", "motion", found, _DRIVE, robot)
 
 
 def _ground_finding(ground: _Ground, robot: str | None, given: Mount | None) -> Finding:
@@ -312,16 +326,12 @@ def _ground_finding(ground: _Ground, robot: str | None, given: Mount | None) -> 
     return Finding(verdict, "ground", found, remedy, robot)
 
 
-def _surely(seen: Fit) -> str:
-    """Return in words how probably the verdict of the odds is wrong."""
-    return f"wrong {one_in(1.0 / (1.0 + math.exp(min(abs(seen.odds), 100.0))))}"
-
-
 def _motion_finding(seen: Fit | None, mirrored: Fit, robot: str | None) -> Finding:
     if seen is None or abs(seen.odds) < SURE:
         found = "too few frames show clearly how the robot moved to compare it with odometry"
-        return Finding("ok", "motion", found, "drive ten metres past walls, poles or trunks and ask again", robot)
-    steps = f"{seen.pairs} steps of some metres, {_surely(seen)}"
+        return Finding("warn", "motion", found, _DRIVE, robot)
+    wrong = one_in(1.0 / (1.0 + math.exp(min(abs(seen.odds), 100.0))))
+    steps = f"{seen.pairs} steps of some metres, wrong {wrong}"
     if seen.odds > 0.0:
         straight = mirrored.odds > seen.odds - SURE
         remedy = "a drive this straight does not tell whether y points left: ask again after a curve" * straight

@@ -258,7 +258,7 @@ def listen(
     names = [*(k.robot for k in keys), *{k.alive.partition(f"/{k.robot}/")[0] for k in keys}]
     candidates = discover(transport, wait, names) if silent or not keys else []
     # robots of any base whose node holds a liveliness token
-    tokens = transport.tokens("**/alive") if candidates else ()
+    tokens = transport.tokens("**/alive") if silent else ()
     return Heard(captures, candidates, {token.split("/")[-2] for token in tokens if "/" in token})
 
 
@@ -274,7 +274,7 @@ def robots_findings(heard: Heard, sha256: str | None = None, mount: Mount | None
         yield from odometry_findings(capture, candidates_text(heard.candidates, "odometry", k.odometry, others))
         yield from cross_findings(capture)
         yield from frame_findings(captured_frames(capture, mount), k.robot, mount)
-        yield node_finding(capture, sha256)
+        yield node_finding(capture, sha256, others)
     if not heard.captures:
         texts = [text for channel in ("cloud", "odometry") if (text := candidates_text(heard.candidates, channel))]
         if texts:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import heapq
 import math
 import statistics
-from collections.abc import Iterator, Sequence
+from collections.abc import Collection, Iterator, Sequence
 from itertools import pairwise
 from typing import Any
 
@@ -283,7 +283,7 @@ def pairing_finding(
         found += f" ({', '.join(dropped)})"
     if jumps := kinds[SampleKind.JUMP]:
         found += f"; odometry jumps {jumps} times"
-        remedy = "two senders of odometry, or one that restarts: after each jump the robot is LOST"
+        remedy = "two senders of odometry, one that restarts, or not in metres: after each jump the robot is LOST"
         return Finding("FAIL", "pairing", found, remedy, robot)
     if paired < len(clouds) / 2:
         remedy = "send odometry before the cloud that it belongs to, 20 to 100 a second, on the same clock"
@@ -309,10 +309,16 @@ def captured_frames(capture: RobotCapture, mount: Mount | None = None) -> list[S
     return frames
 
 
-def node_finding(capture: RobotCapture, sha256: str | None) -> Finding:
-    """Judge whether a node serves the robot, and its status; ``sha256`` is the expected map's, None: any map."""
+def node_finding(capture: RobotCapture, sha256: str | None, others: Collection[str] = ()) -> Finding:
+    """Judge whether a node serves the robot, and its status; ``sha256`` is the expected map's, None: any map.
+
+    ``others`` are robots that nodes serve.
+    """
     robot, status = capture.keys.robot, capture.status
     if status is None and not capture.alive:
+        if others:
+            named = ", ".join(sorted(others))
+            return Finding("warn", "node", f"none serves it; nodes serve {named}", "is the name right?", robot)
         return Finding("warn", "node", "none is running", f"`coview-stream serve SITE.coview --robot {robot}`", robot)
     if status is None:
         remedy = "is its out/status allowed through, and is --base the same?"

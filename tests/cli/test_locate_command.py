@@ -88,7 +88,7 @@ def test_bad_paths_and_options_are_one_line(world_file, world_run, tmp_path, ref
     for arguments, text in (
         ([str(tmp_path / "none.coview"), str(world_run), *out], "none.coview"),
         ([str(world_run / "odometry.tum"), str(world_run), *out], "not a coview map"),
-        ([str(world_run), str(world_file), *out], "is a run; the map comes first"),
+        ([str(world_run), str(world_file), *out], "is a run, no map"),
         ([str(world_file), str(tmp_path / "none"), *out], "none"),
         ([str(world_file), str(tmp_path), *out], tmp_path.name),
         ([str(world_file), str(world_run), "-o", str(tmp_path / "file")], "is a file"),

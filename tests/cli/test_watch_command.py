@@ -109,8 +109,8 @@ def test_watch_prints_lines_without_terminal(node):
     assert header.split()[:3] == ["robot", "state", "x"]
     cells = line.split()
     assert cells[:6] == ["r1", "TRACKING", "12.34", "-5.00", "1.70", "28.6"]
-    assert float(cells[7]) > 1.0
-    assert cells[8:] == ["1", "in", "10", "-/-", "3", "fine"]
+    assert float(cells[8]) > 1.0
+    assert cells[9:] == ["1", "in", "10", "-/-", "3", "fine"]
 
 
 @pytest.mark.slow
@@ -154,7 +154,7 @@ def test_watch_explains_missing_messages():
         out, err = watch(node.endpoint, "--base", "site/a", err=Screen(1))
     assert out == ""
     assert err.count("\n") == 1
-    assert "nothing yet on site/a/*/out/pose, site/a/*/out/status; connected to 1 other(s)" in err
+    assert "nothing yet on site/a/*/out/pose, site/a/*/out/status; connected to 1 program" in err
     assert node.endpoint in err
 
 

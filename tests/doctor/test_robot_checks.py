@@ -245,6 +245,11 @@ def test_node_status_finding(status, alive, verdict, part):
     assert part in found.found
 
 
+def test_robots_that_nodes_serve_are_named_beside_a_wrong_name():
+    found = node_finding(capture(), SHA, {"r3", "r2"})
+    assert (found.verdict, found.found) == ("warn", "none serves it; nodes serve r2, r3")
+
+
 def test_who_serves_the_robot_is_told():
     robot = capture(status=STATUS, alive=True)
     robot.servers = {"abc on machine-7"}

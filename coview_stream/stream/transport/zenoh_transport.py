@@ -291,7 +291,9 @@ class ZenohTransport:
             self.close()
             raise error
         if error is not None:
-            _log.warning("no router at %s, or it refuses us (RUST_LOG=zenoh=warn says more): waiting for it", where)
+            _log.warning(
+                "no node or router at %s, or it refuses us (RUST_LOG=zenoh=warn says more): waiting for it", where
+            )
 
     def _keep_trying(self, first: SimpleQueue[TransportError | None]) -> None:
         while not self._closing.is_set():
