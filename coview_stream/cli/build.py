@@ -101,8 +101,8 @@ def run(args: argparse.Namespace) -> int:
     from coview_stream.config import map_preset
     from coview_stream.errors import ConfigError, MapError
 
-    for path in map(Path, args.maps):
-        _refuse_frames(path)
+    for name in args.maps:
+        _refuse_frames(Path(name))
     output = Path(args.output)
     if output.resolve() in [Path(name).resolve() for name in args.maps]:
         raise MapError(f"{output}: is one of the scans to read; give the map another name")
@@ -132,6 +132,8 @@ def _refuse_frames(path: Path) -> None:
     from coview_stream.clouds.files import is_cloud_name
     from coview_stream.errors import MapError
 
+    if not os.path.isdir(path):  # noqa: PTH112 - never raises
+        return
     place = path.resolve()
     frames = place if place.name == "frames" else place / "frames"
     if not (frames.is_dir() and (frames.parent / "odometry.tum").is_file()):

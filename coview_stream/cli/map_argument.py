@@ -56,7 +56,7 @@ def refuse_run(path: Path) -> None:
     from coview_stream.recordings.layouts import is_run
 
     if is_run(path):
-        raise MapError(f"{path}: is a run, no map; a map is built from a scan of the site and comes before a run")
+        raise MapError(f"{path}: is a run, no map; give the map (SITE.coview) first, then the run")
 
 
 def local_map(

@@ -136,5 +136,5 @@ def _served(transport: Transport, base: str, robot: str) -> str:
     except TransportError:
         names = []
     if robot in names:
-        return ": a node serves the robot by other keys (--preset)"
+        return ": a node names the robot, but by other keys (--preset, --cloud-key), or does not serve it yet"
     return f": nodes serve {printable(', '.join(names[:_NAMED]))}{', ...' * (len(names) > _NAMED)}" * bool(names)

@@ -96,7 +96,7 @@ def frame_findings(
     if not frames:
         return
     if len(frames) == 1:
-        yield Finding("warn", "motion", "one frame shows no motion: axes and units are not checked", _DRIVE, robot)
+        yield Finding("warn", "motion", "one frame shows no motion: axes and units were not checked", _DRIVE, robot)
         return
     unit = float(np.median([unit_of(frame.points) for frame in frames]))
     if unit != 1.0:
@@ -186,7 +186,7 @@ def _explanations(
     """
     candidates: list[tuple[float, Finding]] = []
     sent = seen is not None and ground is not None and not ground.axis and unit == 1.0
-    as_sent = seen.odds if sent and seen is not None else 0.0
+    as_sent = seen.odds if sent and seen is not None else -math.inf
     enough = max(0.0, as_sent) + SURE
 
     def explained() -> bool:
@@ -234,7 +234,7 @@ def _explanations(
     odds = np.array([*(odds for odds, _ in candidates), 0.0, as_sent])
     shares = np.exp(odds - odds.max())
     shares /= shares.sum()
-    told = [finding for each, finding in candidates if odds[0] - each < SURE]
+    told = [finding for each, finding in candidates if each > enough and odds[0] - each < SURE]
     if len(told) == 1:
         return [replace(told[0], found=f"{told[0].found} (wrong {one_in(1.0 - shares[0])})")]
     shown = [f"{each.found} ({share:.0%} probable)" for each, share in zip(told, shares, strict=False)]

@@ -30,6 +30,7 @@ _MIN_CLOUD_RATE, _MAX_CLOUD_RATE = 2.0, 30.0  # Hz; at 2 Hz and 5 m/s frames are
 _MIN_ODOMETRY_RATE = 5.0  # Hz; poses are published at 10 Hz, each with the newest odometry
 _MIN_PER_CLOUD = 0.9  # least odometry rate per cloud rate: one sample per cloud, with a margin
 _MIN_POINTS = 1000
+_OTHERS = 5  # robots that are named
 _MIN_DISTANCE, _MAX_DISTANCE = 0.3, 300.0  # metres; the median range of a lidar lies between, anywhere
 _NO_TILT = 1e-9  # radians
 _MAX_SLOPE, _MAX_TILT = math.radians(20), math.radians(45)  # robots climb 20 degrees, hardly 45
@@ -283,7 +284,7 @@ def pairing_finding(
         found += f" ({', '.join(dropped)})"
     if jumps := kinds[SampleKind.JUMP]:
         found += f"; odometry jumps {jumps} times"
-        remedy = "two senders of odometry, one that restarts, or not in metres: after each jump the robot is LOST"
+        remedy = "two senders of odometry, one that restarts, or no metres: after each jump the robot is LOST"
         return Finding("FAIL", "pairing", found, remedy, robot)
     if paired < len(clouds) / 2:
         remedy = "send odometry before the cloud that it belongs to, 20 to 100 a second, on the same clock"
@@ -316,10 +317,11 @@ def node_finding(capture: RobotCapture, sha256: str | None, others: Collection[s
     """
     robot, status = capture.keys.robot, capture.status
     if status is None and not capture.alive:
-        if others:
-            named = ", ".join(sorted(others))
-            return Finding("warn", "node", f"none serves it; nodes serve {named}", "is the name right?", robot)
-        return Finding("warn", "node", "none is running", f"`coview-stream serve SITE.coview --robot {robot}`", robot)
+        remedy = f"`coview-stream serve SITE.coview --robot {robot}`"
+        if others and not (capture.clouds or capture.odometry):
+            found = f"none serves it; nodes serve {', '.join(sorted(others)[:_OTHERS])}"
+            return Finding("warn", "node", found, f"is the name right? else {remedy}", robot)
+        return Finding("warn", "node", "none is running", remedy, robot)
     if status is None:
         remedy = "is its out/status allowed through, and is --base the same?"
         return Finding("warn", "node", "alive, but says nothing", remedy, robot)
