@@ -82,8 +82,8 @@ class GroundChange:
         self._started = False
         self._T_map_source = np.eye(4)  # of the newest lesson
         self._h = 0.0  # metres by which registrations have raised the robot above odometry's path
-        self._origin = 0.0  # value of _h at the zero of the heights: a multiple of their step
-        self._copied = 0.0  # value of _h at which the newest patches fitted the survey best
+        self._zeros = np.zeros(2)  # values of _h at the zero of the heights, of the kinds and of structure
+        self._lowered = 0.0  # metres by which the ground of the newest lesson was lowered
         size = np.abs(_HEIGHTS) - _LEAST
         dug = np.where(size > 0.0, np.exp(-size / _DEPTH), 0.0)
         as_surveyed = np.exp(-0.5 * (_HEIGHTS / _START) ** 2)
@@ -128,19 +128,20 @@ class GroundChange:
             # compared here, not where the robot was: along a leaning odometry frame the height changes by itself
             before, now = (transform(T, position[None])[0, 2] for T in (self._T_map_source, T_map_source))
             self._h += float(now - before)
+            self._zeros[0] += self._scan.ground_offset - self._lowered  # all earlier ground has this offset, too
             self._walk(driven, variance)
         else:
             self._started, driven = True, 0.0
-        self._T_map_source = T_map_source
+        self._T_map_source, self._lowered = T_map_source, self._scan.ground_offset
         self._count_on()
         patches = _Patches(self._scan, T_map_source, position, self._field, target)
         same = patches.likelihoods(_HEIGHTS)
         changed = np.full(len(_HEIGHTS), patches.other_shape())
-        fits = float(_HEIGHTS[same.argmax()])
-        moved = abs(self._h + fits - self._copied) > 2.0 * _STEP  # the end of a pit does not continue a copy
-        copied = np.abs(_HEIGHTS - fits) > _LEAST
-        changed[copied] = np.maximum(changed[copied], same.max() - _COPY * driven - _BROKEN * moved)
-        self._copied = self._h + fits
+        top = same.max()
+        # along odometry a copy moves as surveyed ground would; where that does not fit, it has another depth
+        steady = top + math.log(max(self._kinds[0] @ np.exp(same - top) / self._kinds[0].sum(), 1e-300))
+        copied = np.abs(_HEIGHTS - _HEIGHTS[same.argmax()]) > _LEAST
+        changed[copied] = np.maximum(changed[copied], max(steady, top - _BROKEN) - _COPY * driven)
         logs = np.stack([same, changed])
         self._kinds *= np.exp(logs - logs.max())
         self._kinds /= self._kinds.sum()
@@ -204,14 +205,12 @@ class GroundChange:
 
     def _count_on(self) -> None:
         """Recentre the heights at the present one; those beyond the ends are forgotten."""
-        steps = round((self._h - self._origin) / _STEP)
-        if steps:
-            rows = np.arange(len(_HEIGHTS)) + steps
-            inside = (rows >= 0) & (rows < len(_HEIGHTS))
-            rows = np.clip(rows, 0, len(_HEIGHTS) - 1)
-            self._kinds = np.where(inside, self._kinds[:, rows], 0.0) + 1e-12
-            self._structure = self._structure[rows]
-            self._origin += steps * _STEP
+        steps = np.round((self._h - self._zeros) / _STEP)
+        self._zeros += steps * _STEP
+        kinds, structure = np.arange(len(_HEIGHTS)) + steps[:, None].astype(np.int64)
+        ends = 0, len(_HEIGHTS) - 1
+        self._kinds = np.where(kinds == np.clip(kinds, *ends), self._kinds[:, np.clip(kinds, *ends)], 0.0) + 1e-12
+        self._structure = self._structure[np.clip(structure, *ends)]
 
 
 class _Patches:

@@ -177,3 +177,28 @@ def test_odometry_frame_that_leans_is_no_changed_ground(site):
         assert change.learn(back, here, site.target, 2.0, 2 * 0.004**2) == 0.0
     assert change.probability < 0.01
     assert change.others.reach < 0.5
+
+
+def test_height_that_drifts_within_odometrys_sigma_is_no_changed_ground():
+    """Every registration puts the ground on the survey's; nothing else shows a height."""
+    bare, rng, sigma = Site(huts=0), np.random.default_rng(3), 0.015
+    change, drift = GroundChange(bare.field), 0.0
+    for _ in range(80):
+        drift += sigma * rng.normal()
+        scan = bare.now()
+        scan.points[:, 2] += drift
+        back, here = pose_from(np.eye(3), [0.0, 0.0, -drift]), HERE + [0.0, 0.0, drift]
+        change.without_changed(scan, back, here, bare.target)
+        assert change.learn(back, here, bare.target, 1.0, sigma**2) == 0.0
+        assert change.probability < 0.05
+    assert change.others.reach < 0.5
+
+
+def test_ground_offset_that_becomes_known_is_no_changed_ground():
+    """The more the ground is lowered, the higher the robot is registered: odometry does not climb."""
+    bare = Site(huts=0)
+    change = GroundChange(bare.field)
+    for offset in [*np.linspace(0.0, 0.5, 12), *np.full(40, 0.5)]:
+        assert view(change, bare, bare.now().lowered(offset), offset)[1] == 0.0
+    assert change.probability < 0.05
+    assert change.others.reach < 0.5
