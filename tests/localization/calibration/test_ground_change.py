@@ -187,7 +187,7 @@ def test_height_that_drifts_within_odometrys_sigma_is_no_changed_ground():
         drift += sigma * rng.normal()
         scan = bare.now()
         scan.points[:, 2] += drift
-        back, here = pose_from(np.eye(3), [0.0, 0.0, -drift]), HERE + [0.0, 0.0, drift]
+        back, here = pose_from(np.eye(3), [0.0, 0.0, -drift]), HERE + np.array([0.0, 0.0, drift])
         change.without_changed(scan, back, here, bare.target)
         assert change.learn(back, here, bare.target, 1.0, sigma**2) == 0.0
         assert change.probability < 0.05
