@@ -38,7 +38,7 @@ _DEPTH = 1.5  # metres, mean of a change beyond the least
 _SITES = 2e-2  # share of the sites where the robot starts on changed ground
 _BECOMES, _ENDS = 1e-3, 0.03  # probability per metre that changed ground starts, and that it ends: sites are small
 _COPY = 0.1  # nats per metre against a copy of the survey's ground
-_BROKEN = 5.0  # nats against a copy of the survey's ground whose height changes
+_BROKEN = 5.0  # most nats against a copy of the survey's ground that does not move along odometry
 _SURE = 0.9  # probability of another height, within half a metre, above which the robot is moved there
 _ANEW = 1e-6  # probability per metre that the whole belief is wrong
 _START = 0.1  # metres, one sigma of a registered height on ground as surveyed
@@ -89,6 +89,7 @@ class GroundChange:
         as_surveyed = np.exp(-0.5 * (_HEIGHTS / _START) ** 2)
         self._prior = np.stack([(1.0 - _SITES) * as_surveyed / as_surveyed.sum(), _SITES * dug / dug.sum()])
         self._kinds = self._prior.copy()  # (2, H) probabilities of S and C by the patches
+        self._stays = self._prior[0]  # (H,) of S without a part that was C at the last view
         self._structure = np.zeros(len(_HEIGHTS))  # log-likelihood of recently seen structure
 
     def without_changed(
@@ -139,7 +140,7 @@ class GroundChange:
         changed = np.full(len(_HEIGHTS), patches.other_shape())
         top = same.max()
         # along odometry a copy moves as surveyed ground would; where that does not fit, it has another depth
-        steady = top + math.log(max(self._kinds[0] @ np.exp(same - top) / self._kinds[0].sum(), 1e-300))
+        steady = top + math.log(max(self._stays @ np.exp(same - top) / self._stays.sum(), 1e-300))
         copied = np.abs(_HEIGHTS - _HEIGHTS[same.argmax()]) > _LEAST
         changed[copied] = np.maximum(changed[copied], max(steady, top - _BROKEN) - _COPY * driven)
         logs = np.stack([same, changed])
@@ -199,18 +200,19 @@ class GroundChange:
         known[:, 1:] += out * self._kinds[:, :-1]
         known[:, :-1] += out * self._kinds[:, 1:]
         becomes, ends, anew = (min(0.5, rate * driven) for rate in (_BECOMES, _ENDS, _ANEW))
-        same, changed = known
-        known = np.stack([(1.0 - becomes) * same + ends * changed, becomes * same + (1.0 - ends) * changed])
-        self._kinds = (1.0 - anew) * known + anew * self._prior
+        self._stays, changed = known
+        new, back = becomes * self._stays, ends * changed
+        self._kinds = (1.0 - anew) * (known + np.stack([back - new, new - back])) + anew * self._prior
 
     def _count_on(self) -> None:
         """Recentre the heights at the present one; those beyond the ends are forgotten."""
         steps = np.round((self._h - self._zeros) / _STEP)
         self._zeros += steps * _STEP
-        kinds, structure = np.arange(len(_HEIGHTS)) + steps[:, None].astype(np.int64)
-        ends = 0, len(_HEIGHTS) - 1
-        self._kinds = np.where(kinds == np.clip(kinds, *ends), self._kinds[:, np.clip(kinds, *ends)], 0.0) + 1e-12
-        self._structure = self._structure[np.clip(structure, *ends)]
+        wanted = np.arange(len(_HEIGHTS)) + steps[:, None].astype(np.int64)
+        rows = np.clip(wanted, 0, len(_HEIGHTS) - 1)
+        inside = wanted[0] == rows[0]
+        self._kinds, self._stays = (np.where(inside, p[..., rows[0]], 0.0) + 1e-12 for p in (self._kinds, self._stays))
+        self._structure = self._structure[rows[1]]
 
 
 class _Patches:

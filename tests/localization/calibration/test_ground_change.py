@@ -118,6 +118,16 @@ def test_height_goes_on_into_a_pit_of_which_nothing_else_is_seen(site):
     assert rise == 0.0
 
 
+def test_height_goes_on_through_a_level_pit_where_nothing_else_shows_it():
+    bare = Site(huts=0)
+    change = GroundChange(bare.field)
+    for _ in range(60):
+        view(change, bare, bare.now())
+    for _ in range(25):
+        assert view(change, bare, bare.now(lambda xy: np.full(len(xy), -2.0)))[1] == 0.0
+    assert change.probability > 0.9
+
+
 @pytest.mark.parametrize("depth", [-2.0, 1.5])
 def test_robot_that_starts_on_changed_ground_is_put_where_structure_has_it(site, depth):
     """Registered to the survey's ground at first, with a variance that covers it."""
