@@ -25,7 +25,7 @@ from coview_stream.localization.search.advice import AdvisedSearch
 from coview_stream.localization.search.global_search import GlobalSearch
 from coview_stream.localization.search.hints import PlaceGuess, require_ground
 from coview_stream.localization.search.recognizers import SearchIndex
-from coview_stream.localization.search.request import SearchRequest
+from coview_stream.localization.search.request import LostPlace, SearchRequest
 from coview_stream.localization.search_requests import NoSearch, SearchRequests
 from coview_stream.localization.state import Event, State, next_state
 from coview_stream.localization.tracking.map_matching import MapMatch
@@ -310,7 +310,7 @@ class Localizer(SavedState):
             if self.state.has_place and self._newest is not None:  # the robot was moved, or is still here
                 here = self._tracker.T_map_odom @ self._newest.T_odom_body
                 self._handle(Event.PLACE_GIVEN_UP)
-                self._requests.hints.robot_at(here)
+                self._requests.hints.odometry_begins_anew(here)
             self._frames.begin_odometry()
             self._tracker.forget_odometry()
             self._witness.begin_odometry()
@@ -344,8 +344,10 @@ class Localizer(SavedState):
             self._evidence = KeyframeEvidence(stamp, self.state, "odometry does not go back to this cloud's moment yet")
             return frame, None
         request = self._requests.add(frame, self._tracker.odometry.travelled)
+        if request is None:
+            return frame, None
         if not isinstance(request, NoSearch):
-            return frame, request
+            return frame, replace(request, lost=self._lost_place(frame))
         if request.cause is RejectionReason.ODOMETRY:
             self._frames.estimator.forget_leader()
             self._frames.forget_keyframe()
@@ -353,6 +355,15 @@ class Localizer(SavedState):
             self._handle(Event.SCANS_CONTRADICT)
         self._evidence = KeyframeEvidence(stamp, self.state, request.reason, cause=request.cause)
         return frame, None
+
+    def _lost_place(self, frame: PreparedFrame) -> LostPlace | None:
+        """Return the last known place where odometry continues to a frame; None without one."""
+        assert self._frames.anchor is not None  # a frame has been prepared
+        T_map_odom = self._requests.hints.lost(self._frames.anchor)
+        if T_map_odom is None:
+            return None
+        odds = self._monitor.odds(frame.stamp, self._tracker.odometry.travelled) + self._witness.faults.slipped
+        return LostPlace(T_map_odom, self._tracker.lost_covariance(T_map_odom @ frame.T_odom_body), odds)
 
     def _match_to_map(
         self, frame: PreparedFrame, defer: bool = False, on_doubt: Callable[[], None] = lambda: None
@@ -366,7 +377,9 @@ class Localizer(SavedState):
         newest_only = self.state is State.DOUBTED or self._tracker.looks_displaced(frame.T_odom_body)
         newest_only |= self._witness.between_registrations(self._tracker)
         if due or waited or newest_only:
-            return self._tracker.match_to_map(frame.cloud, frame.T_odom_body, not due, newest_only, on_doubt)
+            return self._tracker.match_to_map(
+                frame.cloud, frame.T_odom_body, not due, newest_only, on_doubt, self._witness.faults.slipped
+            )
         self._tracker.prefetch_map(frame.T_odom_body)
         return None
 
@@ -390,6 +403,8 @@ class Localizer(SavedState):
             )  # fmt: skip
         slips = self._witness.faults.odometry > 0.5
         self._tracker.update(match, self._newest.T_odom_body, ruling.believed, slips)
+        if ruling.believed:
+            self._witness.faults.trusted()
         if ruling.event is not None:
             self._handle(ruling.event)
         return ruling

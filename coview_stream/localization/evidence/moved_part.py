@@ -23,7 +23,9 @@ from coview_stream.localization.evidence.observation import ObservedScan
 
 # set by hand
 _PRIOR = 5e-4  # probability that a survey has a part of the site shifted as a whole
-_LEAST, _MOST = 2.0, 8.0  # metres, range of the shifts
+_LEAST = 2.0  # metres, least shift that unexplained structure shows
+FARTHEST_MOVED = 8.0
+"""Metres, greatest shift of a moved part."""
 _SAME = 2.5  # metres: nearer shifts explain the same points
 _PATCH = 3.0  # metres
 _TAKEN = 1.0  # metres from a point of the scan within which map structure is explained
@@ -51,67 +53,124 @@ def find_moved_part(field: kernels.FieldMap, scans: Sequence[ObservedScan], T_ma
 
     ``T_map_odom`` (4, 4) is the place, registered at the newest keyframe: its lean is the sensor's and turns with it.
     """
-    place = scans[-1].poses(T_map_odom[None])[0]
-    place[3] = 0.0  # from here on points are relative to the body, along the map's axes
-    structure, unexplained = _structure(field, scans, T_map_odom, place)
-    if len(unexplained) < _MIN_POINTS:
+    shifts = _all_shifts()
+    ratios = _shift_ratios(field, _Seen.of(field, scans, T_map_odom), shifts)
+    if ratios is None:
         return NO_PART
-    axis = np.arange(-_MOST, _MOST + 0.5)
+    best = int(ratios.argmax())
+    odds = _PRIOR * math.exp(min(float(ratios[best]), 100.0)) / len(shifts)
+    return MovedPart(odds / (1.0 + odds), float(np.linalg.norm(shifts[best])))
+
+
+def log_odds_of_moved(
+    field: kernels.FieldMap, scans: Sequence[ObservedScan], T_map_odom: Floats, T_map_other: Floats
+) -> float:
+    """Return the log-odds of "the robot is at the other place, and what fits here has moved" to "it is here".
+
+    Here is ``T_map_odom``; other arguments are as in :func:`find_moved_part`. The moved share of the view is unknown:
+    that it comprises all N patches that fit here alone has probability 1 / (N + 1). No part moves farther than
+    :data:`FARTHEST_MOVED`.
+    """
+    here, other = scans[-1].poses(np.stack([T_map_odom, T_map_other]))
+    shift = (other - here)[:2]
+    if float(np.linalg.norm(shift)) > FARTHEST_MOVED:
+        return -math.inf
+    seen, alone, ratios = _Seen.of(field, scans, T_map_odom).turned(float(other[3] - here[3])), 0.0, None
+    if len(seen.explained):
+        there = kernels.near_structure(field, seen.explained, seen.place, shift[None])[0]
+        alone = float((1.0 - _in_patches(seen.explained) @ there.astype(np.float64)).sum())
+    if float(np.linalg.norm(shift)) >= _LEAST:
+        ratios = _shift_ratios(field, seen, np.concatenate([_all_shifts(), shift[None]]))
+    return math.log(_PRIOR) - math.log1p(alone) + (0.0 if ratios is None else float(ratios[-1]))
+
+
+def _all_shifts() -> Floats:
+    """Return (H, 2) the shifts tried, a metre apart."""
+    axis = np.arange(-FARTHEST_MOVED, FARTHEST_MOVED + 0.5)
     shifts: Floats = np.stack(np.meshgrid(axis, axis), axis=-1).reshape(-1, 2)
     length = np.linalg.norm(shifts, axis=1)
-    shifts = shifts[(length >= _LEAST) & (length <= _MOST)]
-    cell = np.floor(unexplained[:, :2] / np.float32(_PATCH)).astype(np.int64)
-    patch = np.unique(cell, axis=0, return_inverse=True)[1].ravel()
-    weights = (patch == np.arange(int(patch.max()) + 1)[:, None]).astype(np.float64)  # of points in patches
-    weights /= weights.sum(axis=1, keepdims=True)
-    fits = weights @ _explained(field, unexplained, structure, shifts, place).T  # (P, H) shares
+    return np.asarray(shifts[(length >= _LEAST) & (length <= FARTHEST_MOVED)])
+
+
+def _shift_ratios(field: kernels.FieldMap, seen: _Seen, shifts: Floats) -> Floats | None:
+    """Return the log-ratios (H,) of "unexplained structure belongs at this shift" against chance.
+
+    None for too few points.
+    """
+    if len(seen.unexplained) < _MIN_POINTS:
+        return None
+    fits = _in_patches(seen.unexplained) @ _explained(field, seen, shifts).T  # (P, H) shares
     chance = np.ones(len(shifts), dtype=bool)
     for _ in range(2):
         usual = (fits[:, chance].sum(axis=1) + _PSEUDO * _PSEUDO_SHARE) / (int(chance.sum()) + _PSEUDO)
         ratios = _log_likelihood_ratios(fits, np.clip(usual, *_SHARES))
         best = int(ratios.argmax())
         chance = np.linalg.norm(shifts - shifts[best], axis=1) > _SAME
-    odds = _PRIOR * math.exp(min(float(ratios[best]), 100.0)) / len(shifts)
-    return MovedPart(odds / (1.0 + odds), float(np.linalg.norm(shifts[best])))
+    return ratios
 
 
-def _structure(
-    field: kernels.FieldMap, scans: Sequence[ObservedScan], T_map_odom: Floats, place: Floats
-) -> tuple[Points, Points]:
-    """Return the scans' structure at a place, and a sample of its unexplained points, both (N, 3)."""
-    shown, unexplained = [], []
-    T, newest = T_map_odom[None], scans[-1].T_odom_body[:3, :3]
-    lean = newest.T @ rot_z(-yaw_of(T_map_odom)) @ T_map_odom[:3, :3] @ newest  # in the body's axes
-    for scan in reversed(scans):
-        R = scan.T_odom_body[:3, :3]
-        upright = (scan.many.points.structure @ (R @ lean @ R.T).T).astype(np.float32)
-        pose = scan.poses(T)
-        if scan is not scans[-1]:  # undo odometry's drift since then
-            pose = scan.few.look_up(field, pose, kernels.Move.NEAR).poses
-        T = scan.transforms(pose)
-        cos, sin = math.cos(pose[0, 3]), math.sin(pose[0, 3])
-        turned = upright @ np.array([[cos, sin, 0.0], [-sin, cos, 0.0], [0.0, 0.0, 1.0]])
-        shown.append((turned + (pose[0, :3] - place[:3])).astype(np.float32))
-        unexplained.append(shown[-1][kernels.unexplained(field, upright, pose[0])])
-    points = np.concatenate(unexplained)
+def _in_patches(points: Points) -> Floats:
+    """Return weights (P, N) of points (N, 3) that average over each of P patches."""
+    cell = np.floor(points[:, :2] / np.float32(_PATCH)).astype(np.int64)
+    patch = np.unique(cell, axis=0, return_inverse=True)[1].ravel()
+    weights = (patch == np.arange(int(patch.max()) + 1)[:, None]).astype(np.float64)
+    return np.asarray(weights / weights.sum(axis=1, keepdims=True))
+
+
+@dataclass(frozen=True)
+class _Seen:
+    """The scans' structure, all (N, 3) relative to the body along the map's axes, at a place."""
+
+    place: Floats  # (4,) x, y, z and 0
+    structure: Points
+    explained: Points  # a sample
+    unexplained: Points  # a sample
+
+    def turned(self, angle: float) -> _Seen:
+        """Return the structure turned about the body by an angle, radians."""
+        R = rot_z(angle).T.astype(np.float32)
+        return _Seen(self.place, self.structure @ R, self.explained @ R, self.unexplained @ R)
+
+    @classmethod
+    def of(cls, field: kernels.FieldMap, scans: Sequence[ObservedScan], T_map_odom: Floats) -> _Seen:
+        """Look at scans, newest last, from a place ``T_map_odom`` (4, 4)."""
+        place = scans[-1].poses(T_map_odom[None])[0]
+        place[3] = 0.0
+        shown, unexplained = [], []
+        T, newest = T_map_odom[None], scans[-1].T_odom_body[:3, :3]
+        lean = newest.T @ rot_z(-yaw_of(T_map_odom)) @ T_map_odom[:3, :3] @ newest  # in the body's axes
+        for scan in reversed(scans):
+            R = scan.T_odom_body[:3, :3]
+            upright = (scan.many.points.structure @ (R @ lean @ R.T).T).astype(np.float32)
+            pose = scan.poses(T)
+            if scan is not scans[-1]:  # undo odometry's drift since then
+                pose = scan.few.look_up(field, pose, kernels.Move.NEAR).poses
+            T = scan.transforms(pose)
+            cos, sin = math.cos(pose[0, 3]), math.sin(pose[0, 3])
+            turned = upright @ np.array([[cos, sin, 0.0], [-sin, cos, 0.0], [0.0, 0.0, 1.0]])
+            shown.append((turned + (pose[0, :3] - place[:3])).astype(np.float32))
+            unexplained.append(kernels.unexplained(field, upright, pose[0]))
+        structure, hidden = np.concatenate(shown), np.concatenate(unexplained)
+        return cls(place, structure, _sample(structure[~hidden]), _sample(structure[hidden]))
+
+
+def _sample(points: Points) -> Points:
+    """Return one point per voxel, some hundreds at most."""
     _, first = np.unique(np.floor(points / np.float32(_VOXEL)).astype(np.int64), axis=0, return_index=True)
     points = points[np.sort(first)]
     if len(points) > _MAX_POINTS:
         points = points[np.linspace(0, len(points) - 1, _MAX_POINTS).astype(np.int64)]
-    return np.concatenate(shown), points
+    return points
 
 
-def _explained(field: kernels.FieldMap, points: Points, structure: Points, shifts: Floats, place: Floats) -> Floats:
-    """Return (H, N): 1 where a point (N, 3), at a shift (H, 2) of a place (4,), is near unexplained map structure.
-
-    ``points`` and the scan's ``structure`` (M, 3) are relative to the place.
-    """
-    explained = kernels.near_structure(field, points, place, shifts)
+def _explained(field: kernels.FieldMap, seen: _Seen, shifts: Floats) -> Floats:
+    """Return (H, N): 1 where an unexplained point, at a shift (H, 2), is near unexplained map structure."""
+    explained = kernels.near_structure(field, seen.unexplained, seen.place, shifts)
     shift, point = np.nonzero(explained)
     if len(point):
-        moved = points[point]
+        moved = seen.unexplained[point]
         moved[:, :2] += shifts[shift].astype(np.float32)
-        distance, _ = kernels.nearest(kernels.PointGrid(structure), moved, _TAKEN)
+        distance, _ = kernels.nearest(kernels.PointGrid(seen.structure), moved, _TAKEN)
         explained[shift, point] = ~np.isfinite(distance)
     return explained.astype(np.float64)
 

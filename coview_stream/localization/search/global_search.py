@@ -19,6 +19,7 @@ from coview_stream.localization.registration.clouds import LocalMaps, prepare_sc
 from coview_stream.localization.search.acceptance import Considered, SearchResult, decide
 from coview_stream.localization.search.consensus import Hypothesis
 from coview_stream.localization.search.hints import HintSchedule, on_the_ground, robot_position
+from coview_stream.localization.search.lost_place import weighed_by_odometry
 from coview_stream.localization.search.places import BASIN_ANGLE, BASIN_DISTANCE, Scored
 from coview_stream.localization.search.recognizers import CoViewRecognizer, PlaceRecognizer, SearchIndex
 from coview_stream.localization.search.refinement import find_modes, levelled_by_frame, register_place
@@ -162,6 +163,10 @@ class GlobalSearch:
         undecided = 0.0
         if leader is not None:
             scored = self._gathered(scored, leader, scan, request)
+            scans = [scan] if reading.leans else [*self._scorer.scans[:-1], scan]
+            scored = weighed_by_odometry(
+                scored, leader, request, scans, self.base_map, self.config, reading.scorer.beside
+            )
             if scored.error < self.config.acceptance.risk:
                 place = scored.places[0]
                 modes = find_modes(
@@ -171,7 +176,6 @@ class GlobalSearch:
                 if not undecided:
                     scored = scored.beside(self._registered_rivals(replace(reading, scored=scored), leader))
             if scored.error < 0.5:  # a stated error has to be true even if nothing follows from it
-                scans = [scan] if reading.leans else [*self._scorer.scans[:-1], scan]
                 scored = scored.doubted(find_moved_part(self.base_map.field, scans, leader.T_map_odom))
         result = decide(scored, leader, request, self.config.acceptance, undecided)
         level = reading.level if leader is reading.leader else self._level(leader, request)

@@ -157,6 +157,7 @@ class PoseHints:
     def __init__(self) -> None:
         self._awaited: tuple[Pose, ...] = ()  # T_map_body at the next frame
         self._known: tuple[Pose, ...] = ()
+        self._lost: Pose | None = None  # the lost place, if odometry continues
         self._leader: Pose | None = None  # leading place of the current search
         self._led: tuple[Pose, ...] = ()
         self._guess: PlaceGuess | None = None  # of the place at the next frame
@@ -167,6 +168,7 @@ class PoseHints:
     def clear(self) -> None:
         """Forget all hints, as a place has been accepted."""
         self._awaited = self._known = ()
+        self._lost = None
         self.forget_leader()
         self._guess, self._guessed, self.circle = None, (), None
 
@@ -213,8 +215,18 @@ class PoseHints:
 
     def odometry_continues(self, T_map_odom: Pose, anchor: Floats) -> None:
         """Hint, replacing all others, that odometry continues: ``T_map_odom`` (4, 4) about ``anchor`` (3,)."""
-        self._awaited, self._known = (), (T_map_odom @ pose_from(np.eye(3), -anchor),)
+        self._lost = T_map_odom @ pose_from(np.eye(3), -anchor)
+        self._awaited, self._known = (), (self._lost,)
         self.forget_leader()
+
+    def odometry_begins_anew(self, T_map_body: Pose) -> None:
+        """Hint that the robot is at ``T_map_body`` (4, 4) at the next frame, to which odometry did not lead."""
+        self._lost = None
+        self.robot_at(T_map_body)
+
+    def lost(self, anchor: Floats) -> Pose | None:
+        """Return the lost place as ``T_map_odom`` about ``anchor`` (3,); None without one that odometry continues."""
+        return None if self._lost is None else self._lost @ pose_from(np.eye(3), anchor)
 
     def place_leads(self, T_map_odom: Pose, anchor: Floats) -> None:
         """Store the search's leader, ``T_map_odom`` (4, 4) about ``anchor`` (3,), as a hint for the next search."""

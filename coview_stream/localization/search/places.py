@@ -79,6 +79,17 @@ class Scored:
             second=max(rivals, key=lambda place: place.probability),
         )  # fmt: skip
 
+    def confirmed(self, odds: float) -> Scored:
+        """Add knowledge that puts the robot at the first place; ``odds`` are those it would have without the scans."""
+        share = 1.0 / (1.0 + (1.0 - self.error) * odds)
+        places = [replace(place, probability=share * place.probability) for place in self.places]
+        places[0] = replace(places[0], probability=(1.0 + odds) * places[0].probability)
+        second = next((k for k, place in enumerate(self.places) if place is self.second), None)
+        return replace(
+            self, places=places, error=share * self.error, none=share * self.none,
+            second=None if second is None else places[second],
+        )  # fmt: skip
+
     def doubted(self, moved: MovedPart) -> Scored:
         """Add the error by a moved part, as either part may be the unmoved one."""
         return replace(self, error=min(1.0, self.error + 0.5 * moved.probability), moved=moved)

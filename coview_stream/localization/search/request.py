@@ -27,6 +27,14 @@ class Epoch(NamedTuple):
 FIRST_EPOCH = Epoch()
 
 
+class LostPlace(NamedTuple):
+    """The last known place, continued by odometry through a loss."""
+
+    T_map_odom: Pose  # (4, 4)
+    covariance: Floats  # (6, 6) of the body's pose over (rx, ry, rz, x, y, z), map axes
+    odds: float  # that the robot is not there: the place was wrong, odometry has slipped, the robot was carried
+
+
 def _no_points() -> Points:
     return np.empty((0, 3), dtype=np.float32)
 
@@ -61,6 +69,7 @@ class SearchRequest:
     hints: tuple[Pose, ...] = ()  # possible T_map_odom, each (4, 4), judged like the votes' hypotheses
     # T_map_odom by a PlaceGuess, each (4, 4), with unknown heights, judged likewise
     guesses: tuple[Pose, ...] = ()
+    lost: LostPlace | None = None  # None before the first place, and where odometry has begun anew since
     # (N, 3) float32 points within RequestSpec.reach, odometry frame; empty if unneeded
     surroundings: Points = field(default_factory=_no_points)
     calibration: Calibration = field(default_factory=Calibration)  # that levelled cloud

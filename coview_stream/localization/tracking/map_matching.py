@@ -205,13 +205,15 @@ class MapMatcher:
         return [self._against(attempt, tries) for attempt in tries]
 
     def against_odometry(
-        self, match: MapMatch, scan: ObservedScan, tries: list[MapMatch], belief: Estimate, travelled: float
-    ) -> MapMatch:
+        self, match: MapMatch, scan: ObservedScan, tries: list[MapMatch], belief: Estimate, travelled: float,
+        slipped: float,
+    ) -> MapMatch:  # fmt: skip
         """Judge the best of ``tries``, which fits but contradicts ``belief``, odometry's pose.
 
         Within odometry's drift there is no contradiction. If the two poses are near enough for both to be right, the
         lidar is believed, without a pose until the next frame agrees; but not if their heights differ by more than the
         drift, as no wheel slips upwards. Else the place moves only if the evidence of the scans supports that.
+        ``slipped`` are the odds, by the clouds alone, that odometry has slipped.
         """
         rule, T_map_predicted = self._config.acceptance, belief.T_map_body
         plausible = match.innovation <= rule.max_innovation
@@ -228,7 +230,7 @@ class MapMatcher:
         if not moves:
             places = [other.T_map_body for other in tries if other.scan is not None]
             places += [rival.T_map_odom @ scan.T_odom_body for other in tries for rival in other.rivals]
-            right = self.dispute.settle(scan, T_map_predicted, places, travelled, rule.risk)
+            right = self.dispute.settle(scan, T_map_predicted, places, travelled, rule.risk, slipped)
             if right is not None:
                 verified = [other for other in tries if other.verdict.verified]
                 match = min(verified, key=lambda other: off_by(right, other.T_map_body)[0], default=match)

@@ -172,6 +172,11 @@ class LossMonitor:
         self._seen_since = 0.0  # stamp of the first doubted registration that was not blind
         self._required = False  # whether a registration has to be believed before the next pose
 
+    def odds(self, stamp: float, travelled: float) -> float:
+        """Return the odds that the robot is not where odometry continues from the newest registration."""
+        waited, driven = (0.0, 0.0) if self._newest is None else (stamp - self._newest[0], travelled - self._newest[1])
+        return self._odds + PER_METRE * max(driven, 0.0) + _PER_SECOND * max(waited, 0.0)
+
     def require_verification(self) -> None:
         """Start a doubt, as the robot may have been carried unseen."""
         if not self._required:

@@ -9,6 +9,7 @@ changed, and against it where nearly all was explained a metre before.
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -19,6 +20,7 @@ from coview_stream.geometry.arrays import Floats
 from coview_stream.geometry.transforms import Pose
 from coview_stream.localization.evidence.background import Background, observe_with_background
 from coview_stream.localization.evidence.likelihood import KEPT, NUISANCES, log_likelihoods
+from coview_stream.localization.evidence.moved_part import log_odds_of_moved
 from coview_stream.localization.evidence.observation import ObservedScan
 
 # set by hand; right registrations of seven drives and three real runs hardly depend on them (docs/integrity.md)
@@ -68,6 +70,10 @@ class PlaceEvidence:
         """Move poses (H, 4) to the best ones nearby; return them and their log-likelihood ratios (H,)."""
         observed = scan.few.look_up(self._base_map.field, poses, Move.NEAR)
         return observed.poses, self._ratios(log_likelihoods(observed.shares, self._background(scan, T_map_odom)))
+
+    def log_odds_of_moved(self, scans: Sequence[ObservedScan], T_map_odom: Pose, T_map_other: Pose) -> float:
+        """Return the log-odds that the scans fit at a pose (4, 4) only since what they show has moved."""
+        return log_odds_of_moved(self._base_map.field, scans, T_map_odom, T_map_other)
 
     def learn(self, observation: Observation) -> None:
         """Learn the nuisance parameters from a believed registration; others would make a wrong place usual."""

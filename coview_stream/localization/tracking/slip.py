@@ -20,6 +20,8 @@ from coview_stream.localization.evidence.observation import ObservedScan
 from coview_stream.localization.registration.clouds import LocalMap
 from coview_stream.localization.tracking.place_evidence import PlaceEvidence
 
+_VIEWS = 8  # newest views in which a moved part is searched for
+
 
 def off_by(T_map_body: Pose, T_map_other: Pose) -> tuple[float, float]:
     """Return metres and degrees between two poses."""
@@ -36,7 +38,8 @@ class Dispute:
     """Candidate places while odometry is contradicted, and the scans' evidence for each of them.
 
     The first is odometry's. Scans within one view (a metre) see the same, so the newest of a view counts, and views add
-    up. The prior is even; a place that appears later starts with the evidence of the first.
+    up. A place that appears later starts with the evidence of the first. Odometry's prior is what the clouds show of a
+    slip, and what fits beside it may have moved since the survey, however many scans show that.
     """
 
     def __init__(self, place: PlaceEvidence, view: float) -> None:
@@ -51,27 +54,35 @@ class Dispute:
         self._before = np.zeros(0)  # log-likelihood ratios of the earlier views
         self._newest = np.zeros(0)  # and of the current one
         self._begun = -math.inf  # metres driven at the start of the view
+        self._scans: list[ObservedScan] = []  # the newest of each view
 
     def settle(
-        self, scan: ObservedScan, T_map_predicted: Pose, T_map_seen: Sequence[Pose], travelled: float, risk: float
-    ) -> Pose | None:
+        self, scan: ObservedScan, T_map_predicted: Pose, T_map_seen: Sequence[Pose], travelled: float, risk: float,
+        slipped: float,
+    ) -> Pose | None:  # fmt: skip
         """Return the right ``T_map_body`` (4, 4) if odometry has slipped; None while undecided.
 
         The candidates are the pose by odometry and the registered ones ``T_map_seen``; ``risk`` is the accepted
-        probability that another candidate is right, too far off for both to be right.
+        probability that another candidate is right, too far off for both to be right. ``slipped`` are the odds, by the
+        clouds alone, that odometry has slipped.
         """
         if travelled - self._begun >= self._view:
             self._begun = travelled
             self._before = self._before + self._newest
+            self._scans = [*self._scans, scan][-_VIEWS:]
+        self._scans[-1] = scan
         T_body_odom = inverse(scan.T_odom_body)
         owners = self._assign(T_map_predicted, T_map_seen, scan.T_odom_body)
         candidates = [T_map_predicted @ T_body_odom, *self._poses[1:], *(T @ T_body_odom for T in T_map_seen)]
         ratios = self._place.ratios(scan, np.stack(candidates))
         self._newest = ratios[: len(self._poses)].copy()
         np.maximum.at(self._newest, owners, ratios[len(self._poses) :])
-        total = self._before + self._newest
-        best = int(total.argmax())
-        here = [T @ scan.T_odom_body for T in self._poses]
+        total, here = self._before + self._newest, [T @ scan.T_odom_body for T in self._poses]
+        total[0] -= math.log(slipped)
+        if best := int(total.argmax()):  # or odometry is right, and what fits here has moved
+            moved = self._place.log_odds_of_moved(self._scans, self._poses[best], self._poses[0])
+            total[0] = np.logaddexp(total[0], total[best] + moved - math.log(slipped))
+            best = int(total.argmax())
         # a place near the best one contradicts it only if it is odometry's
         apart = np.array([k == 0 or matters(*off_by(T, here[best])) for k, T in enumerate(here)])
         if best == 0 or total[best] - np.logaddexp.reduce(total[apart]) < -math.log(risk):

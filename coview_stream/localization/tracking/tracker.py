@@ -142,7 +142,7 @@ class Tracker:
 
     def match_to_map(
         self, cloud: Points, T_odom_body: Pose, standing_still: bool = False, newest_only: bool = False,
-        on_doubt: Callable[[], None] = lambda: None,
+        on_doubt: Callable[[], None] = lambda: None, slipped: float = 1.0,
     ) -> MapMatch:  # fmt: skip
         """Register the newest scans from the predicted pose (eq. 13), verify and judge.
 
@@ -150,7 +150,7 @@ class Tracker:
         ``standing_still`` uses only frames since the last registration, and trusts odometry slightly less, as repeated
         views of a standing robot must not add up to certainty. ``newest_only`` uses only the newest frame, if the
         frames are in doubt. ``on_doubt`` is called if the place is contradicted, some tenths of a second before the
-        search around is done.
+        search around is done. ``slipped`` are the odds, by the clouds alone, that odometry has slipped.
         """
         self._matcher.shared.repeats = max(1.0, _MIN_DISTANCE / max(self.odometry.since_keyframe()[0], _LEAST_DISTANCE))
         belief = self._predict(T_odom_body, standing_still)
@@ -181,7 +181,7 @@ class Tracker:
             tries = self._matcher.match_widely(match, scan, wider, target, belief)
             match = best_of(tries, limit)
         if match.verdict.verified and (match.innovation > limit or self._disputed):
-            return self._matcher.against_odometry(match, scan, tries, belief, self.odometry.travelled)
+            return self._matcher.against_odometry(match, scan, tries, belief, self.odometry.travelled, slipped)
         return match
 
     def update(self, match: MapMatch, T_odom_body: Pose, believed: bool, slips: bool = False) -> None:
@@ -216,11 +216,18 @@ class Tracker:
         last = self.odometry.pose
         if not len(self._graph) or last is None:
             return np.asarray(_START.copy())
+        return self._covariance_at(self.T_map_odom @ last) + self._calibration.calibration.extrapolation
+
+    def lost_covariance(self, T_map_body: Pose) -> Floats:
+        """Covariance (6, 6), likewise, of the pose (4, 4) to which odometry has led since the place was lost."""
+        driven, turned = self.odometry.since_keyframe()
+        sideways = self.odometry.drift.variances(driven, turned)[2] * driven**2 / 3.0  # the heading drifts on the way
+        return self._covariance_at(T_map_body) + np.diag([0.0, 0.0, 0.0, sideways, sideways, 0.0])
+
+    def _covariance_at(self, T_map_body: Pose) -> Floats:
         belief = self.belief
-        here = self.T_map_odom @ last
-        carried = propagate(belief.covariance, here[:3, 3] - belief.T_map_body[:3, 3])
-        drifted = self.odometry.drift.covariance(*self.odometry.since_keyframe())
-        return np.asarray(carried + drifted + self._calibration.calibration.extrapolation)
+        carried = propagate(belief.covariance, T_map_body[:3, 3] - belief.T_map_body[:3, 3])
+        return np.asarray(carried + self.odometry.drift.covariance(*self.odometry.since_keyframe()))
 
     def reported_covariance(self, mount_and_clock: bool = True) -> Floats:
         """Covariance (6, 6) over (x, y, z, roll, pitch, yaw), map axes, of the body at the stamp.

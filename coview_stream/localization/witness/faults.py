@@ -175,6 +175,7 @@ class FaultPosterior:
     moved: list[_Moved] = field(default_factory=list)
     scaled: list[_Scaled] = field(default_factory=list)
     parting: list[_Parting] = field(default_factory=list)
+    astray: float = 0.0  # probability that odometry has gone wrong at some step since ``trusted``
     _driven: float = 0.0  # metres by odometry since the scan has been repeated
     _moved_on: float = 0.0  # metres by the clouds since odometry has stood still
     _speed: Floats = field(default_factory=lambda: np.zeros(3))  # of the newest step; includes the body's tilting
@@ -189,6 +190,12 @@ class FaultPosterior:
     def odometry(self) -> float:
         """Probability that odometry is wrong and the lidar right."""
         return self.slip + sum(h.weight for h in self.scaled)
+
+    @property
+    def slipped(self) -> float:
+        """Odds that odometry has gone wrong since ``trusted``, between a millionth and a million."""
+        right = (1.0 - self.astray) * (1.0 - self.odometry)
+        return max(1.0 - right, _NEGLIGIBLE) / max(right, _NEGLIGIBLE)
 
     @property
     def sensors(self) -> float:
@@ -292,6 +299,7 @@ class FaultPosterior:
             return
         self.slip, self.repeated, self.mixed = new_slip / total, new_repeated / total, new_mixed / total
         self.stopped = new_stopped / total
+        self.astray += (1.0 - self.astray) * (self.slip + self.stopped)
         self.steady, self.growing = np.maximum(steady, 0.0) / total, growing / total
         self.moved = [replace(h, weight=h.weight / total) for h in moved]
         self.scaled = [replace(h, weight=h.weight / total) for h in scaled]
@@ -302,6 +310,10 @@ class FaultPosterior:
             metres = float(np.linalg.norm(step.clouds.motion[:2]))
             moves = metres > 3.0 * math.sqrt(float(step.clouds.covariance[0, 0]))  # else both stand still and agree
             self._moved_on = self._moved_on + metres if moves and self.stopped > _NEGLIGIBLE else 0.0
+
+    def trusted(self) -> None:
+        """Take odometry as right so far, as the map has verified a pose by it."""
+        self.astray = 0.0
 
     def forget_speed(self) -> None:
         """Forget the newest step, as the next one does not continue it."""
