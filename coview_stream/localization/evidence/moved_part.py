@@ -65,7 +65,7 @@ def find_moved_part(field: kernels.FieldMap, scans: Sequence[ObservedScan], T_ma
 def log_odds_of_moved(
     field: kernels.FieldMap, scans: Sequence[ObservedScan], T_map_odom: Floats, T_map_other: Floats
 ) -> float:
-    """Return the log-odds of "the robot is at the other place, and what fits here has moved" to "it is here".
+    """Return the log-odds of "the robot is at the other place, and structure that fits here has moved" to "it is here".
 
     Here is ``T_map_odom``; other arguments are as in :func:`find_moved_part`. The moved share of the view is unknown:
     that it comprises all N patches that fit here alone has probability 1 / (N + 1). No part moves farther than

@@ -72,7 +72,7 @@ class PlaceEvidence:
         return observed.poses, self._ratios(log_likelihoods(observed.shares, self._background(scan, T_map_odom)))
 
     def log_odds_of_moved(self, scans: Sequence[ObservedScan], T_map_odom: Pose, T_map_other: Pose) -> float:
-        """Return the log-odds that the scans fit at a pose (4, 4) only since what they show has moved."""
+        """Return the log-odds that the robot is at the other pose, and the structure that fits here has moved."""
         return log_odds_of_moved(self._base_map.field, scans, T_map_odom, T_map_other)
 
     def learn(self, observation: Observation) -> None:

@@ -38,8 +38,9 @@ class Dispute:
     """Candidate places while odometry is contradicted, and the scans' evidence for each of them.
 
     The first is odometry's. Scans within one view (a metre) see the same, so the newest of a view counts, and views add
-    up. A place that appears later starts with the evidence of the first. Odometry's prior is what the clouds show of a
-    slip, and what fits beside it may have moved since the survey, however many scans show that.
+    up. A place that appears later starts with the evidence of the first. Odometry's prior is the
+    probability, by the clouds alone, that it has not slipped. And structure that fits beside it may have moved since
+    the survey, however many scans show that.
     """
 
     def __init__(self, place: PlaceEvidence, view: float) -> None:

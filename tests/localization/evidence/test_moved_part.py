@@ -8,7 +8,7 @@ from trackers import observed
 
 import coview_kernels as kernels
 from coview_stream.geometry.transforms import exp_so3, inverse, pose_from, rot_z, transform
-from coview_stream.localization.evidence.moved_part import NO_PART, MovedPart, _structure, find_moved_part
+from coview_stream.localization.evidence.moved_part import NO_PART, MovedPart, _Seen, find_moved_part, log_odds_of_moved
 from coview_stream.localization.evidence.observation import ObservedScan
 
 ODOM = pose_from(rot_z(-0.7), [12.0, 40.0, 3.0])  # map <- odometry
@@ -71,8 +71,7 @@ def test_lean_of_the_sensor_leaves_nothing_unexplained(world_map, world_drive):
     """It turns with the body, and is the registered pose's against odometry's vertical."""
 
     def left(T_map_odom, *scans):
-        place = scans[-1].poses(T_map_odom[None])[0] * [1.0, 1.0, 1.0, 0.0]
-        return len(_structure(world_map.field, scans, T_map_odom, place)[1])
+        return len(_Seen.of(world_map.field, scans, T_map_odom).unexplained)
 
     lean, clouds = pose_from(exp_so3([np.radians(4.0), 0.0, 0.0]), np.zeros(3)), world_drive.clouds
     T = [inverse(ODOM) @ world_drive.T_map_body[frame] for frame in (9, 5, 0)]
@@ -99,3 +98,26 @@ def test_what_the_scan_has_explained_at_the_place_is_no_second_time(world_map, s
 def test_few_points_say_nothing(world_map, seen):
     few = replace(seen.many.points, structure=seen.many.points.structure[:9] + np.float32([0.0, 0.0, 40.0]))
     assert found(world_map, replace(seen, many=replace(seen.many, points=few))) == NO_PART
+
+
+def log_odds(world_map, scan, metres, degrees=0.0):
+    """That the scan fits where it was taken only since the map's objects have moved, and that it was so far beside."""
+    body = ODOM @ scan.T_odom_body
+    beside = pose_from(rot_z(np.radians(degrees)) @ body[:3, :3], body[:3, 3] + [metres, 0.0, 0.0])
+    return log_odds_of_moved(world_map.field, [scan], ODOM, beside @ inverse(scan.T_odom_body))
+
+
+def test_view_moved_as_a_whole_only_if_all_of_it_did(world_map, seen):
+    """And a part of it moved where the rest fits beside."""
+    whole = log_odds(world_map, seen, -4.0)
+    shifts = np.zeros((12, 2))
+    shifts[::3] = [4.0, 0.0]  # the rest of what is seen by a robot four metres behind
+    part = log_odds(world_map, with_moved(seen, shifts), -4.0)
+    assert whole < np.log(5e-4) - np.log(5.0)
+    assert part > whole + 5.0
+    assert log_odds(world_map, seen, -9.0) == -np.inf
+
+
+def test_same_pose_but_for_its_heading_shows_other_objects_moved(world_map, seen):
+    assert log_odds(world_map, seen, 0.0, 20.0) < log_odds(world_map, seen, 0.0) - 1.0
+    assert log_odds(world_map, seen, 0.0) == pytest.approx(np.log(5e-4), abs=0.5)  # nothing tells them apart

@@ -143,9 +143,11 @@ def test_hints_stay_at_the_places_that_they_named_before_a_jump():
     kept, anchor, T_odom_body = PoseHints(), np.array([100.0, 0.0, 0.0]), pose_from(rot_z(0.2), [3.0, 1.0, 0.0])
     T_map_odom = pose_from(rot_z(0.3), [5.0, 1.0, 0.0])
     kept.odometry_continues(T_map_odom, anchor)
+    np.testing.assert_allclose(kept.lost(anchor), T_map_odom, atol=1e-9)
     kept.guess(PlaceGuess(0.0, 0.0, within=60.0))
     kept.guessed(np.zeros(3), anchor, T_odom_body)
     kept.odometry_jumped(anchor, T_odom_body)
+    assert kept.lost(anchor) is None  # odometry does not lead from there
     after = pose_from(rot_z(-1.0), [400.0, 7.0, 0.0])
     (hint,) = kept.about(np.zeros(3), after)
     np.testing.assert_allclose(hint @ after, T_map_odom @ T_odom_body, atol=1e-9)
@@ -176,6 +178,9 @@ def test_continuous_odometry_is_the_only_hint_after_loss(world_map, world_drive)
     request = localizer.add_frame(world_drive.clouds[k], world_drive.T_odom_body[k], 0.5 * k)
     (T_map_odom,) = request.hints
     assert_pose(T_map_odom @ request.T_odom_body, world_drive.T_map_body[k], 0.3, 0.5)
+    np.testing.assert_array_equal(request.lost.T_map_odom, T_map_odom)
+    assert 0.01 < np.sqrt(request.lost.covariance[3, 3]) < 1.0  # some metres have been driven
+    assert request.lost.odds > 0.5  # it was given up
 
 
 def test_odometry_frame_hint_is_kept_across_anchors():

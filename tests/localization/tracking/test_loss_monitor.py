@@ -64,6 +64,12 @@ def test_newest_registration_of_a_view_counts(monitor):
     assert monitor.verify(verdict_of(-6.0), 1.0, 2.0).wrong > 50 * first
 
 
+def test_place_that_is_not_seen_is_doubted_by_metres_and_seconds(monitor):
+    wrong = drive(monitor, [8.0])[0].wrong
+    assert monitor.odds(0.0, 0.0) == pytest.approx(wrong, rel=1e-3)
+    assert monitor.odds(100.0, 500.0) == pytest.approx(wrong + 100.0 * 1e-4 + 500.0 * 1e-5, rel=1e-3)
+
+
 @pytest.mark.parametrize("metres", [0.2, 1.5, 20.0])
 def test_one_frame_of_garbage_costs_its_pose_and_two_views_of_it_the_place(monitor, metres):
     """However often the place has fitted: a robot that is carried while it stands is noticed as soon as any other."""

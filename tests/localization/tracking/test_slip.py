@@ -28,10 +28,17 @@ RISK = 1e-4
 
 
 class Told:
-    """A place whose log-likelihood ratios are told, by how far along x a pose is: the nearest of them."""
+    """A place whose log-likelihood ratios are told, by how far along x a pose is: the nearest of them.
 
-    def __init__(self, **ratios):
+    What fits beside odometry's place has moved with log-odds ``moved``.
+    """
+
+    def __init__(self, moved=-np.inf, **ratios):
         self.told = {float(name[1:]): ratio for name, ratio in ratios.items()}
+        self.moved = moved
+
+    def log_odds_of_moved(self, *_):
+        return self.moved
 
     def ratios(self, scan, T_map_odom):
         x = (T_map_odom @ scan.T_odom_body)[:, 0, 3]
@@ -42,24 +49,31 @@ def at(metres):
     return pose_from(np.eye(3), [metres, 0.0, 0.0])
 
 
-def settled(dispute, scan, seen, travelled):
+def settled(dispute, scan, seen, travelled, slipped=1.0):
     """Metres along x of the place that must be right; odometry leads to 0."""
-    winner = dispute.settle(scan, at(0.0), [at(x) for x in seen], travelled, RISK)
+    winner = dispute.settle(scan, at(0.0), [at(x) for x in seen], travelled, RISK, slipped)
     return None if winner is None else float(winner[0, 3])
 
 
+class Unmoved(PlaceEvidence):
+    """A place where nothing moves."""
+
+    def log_odds_of_moved(self, *_):
+        return -np.inf
+
+
 def test_place_that_explains_the_scan_wins_and_the_other_way_round_loses(world_map, scan):
-    (seen, truth), place = scan, PlaceEvidence(world_map)
+    (seen, truth), place = scan, Unmoved(world_map)
     away, T_body_odom = truth @ AWAY, inverse(seen.T_odom_body)
     here, other = place.ratios(seen, np.stack([away @ T_body_odom, truth @ T_body_odom]))
     ratio = other - here
     assert ratio > 10.0
     for risk, slipped in ((1e-4, True), (1.01 * np.exp(-ratio), True), (0.99 * np.exp(-ratio), False)):
-        winner = Dispute(place, 1.0).settle(seen, away, [truth], 0.0, risk)
+        winner = Dispute(place, 1.0).settle(seen, away, [truth], 0.0, risk, 1.0)
         assert (winner is not None) == slipped
         if slipped:
             np.testing.assert_allclose(winner, truth, atol=1e-9)
-        assert Dispute(place, 1.0).settle(seen, truth, [away], 0.0, risk) is None
+        assert Dispute(place, 1.0).settle(seen, truth, [away], 0.0, risk, 1.0) is None
 
 
 def test_place_must_be_better_than_all_others(scan):
@@ -74,6 +88,15 @@ def test_views_add_up_and_frames_of_one_view_do_not(scan):
     assert [settled(dispute, scan[0], [1.0], metres) for metres in (1.0, 1.5, 2.1)] == [None, None, 1.0]
     dispute.clear()
     assert settled(dispute, scan[0], [1.0], 2.2) is None
+
+
+def test_building_that_moved_is_one_event_in_however_many_views_and_only_clouds_show_a_slip(scan):
+    for slipped, expected in ((0.01, [None] * 20), (1e4, [1.0] * 20)):
+        dispute = Dispute(Told(x0=2.0, x1=12.0, moved=-9.0), 1.0)
+        assert [settled(dispute, scan[0], [1.0], float(view), slipped) for view in range(20)] == expected
+    dispute = Dispute(Told(x0=2.0, x1=12.0), 1.0)  # a place where nothing moves
+    assert settled(dispute, scan[0], [1.0], 0.0, 0.01) is None
+    assert settled(dispute, scan[0], [1.0], 1.0, 0.01) == 1.0
 
 
 def test_place_that_is_not_registered_again_is_weighed_all_the_same(scan):

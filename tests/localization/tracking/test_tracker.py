@@ -235,7 +235,7 @@ def test_odometry_slip_is_detected_and_corrected(world_map, slow_drive, slip):
     drift = ride.tracker.odometry.drift
     metres, degrees = pose_error(slip, np.eye(4))
     ride.slips(slip, truth[k - 1])
-    verdict = ride.update(clouds[k], truth[k])
+    verdict = ride.update(clouds[k], truth[k], slipped=1e3)  # by the clouds
     assert verdict.cause is RejectionReason.ODOMETRY
     assert not verdict.verified
     assert verdict.innovation > RULE.max_innovation

@@ -293,3 +293,12 @@ def test_a_scale_that_the_calibration_has_learned_is_not_learned_twice():
     faults, _, _ = drive(lambda o, t: (o * [1.5, 1.5, 1.0], o))
     faults.corrected(np.zeros(3), 0.0, 0.8)
     assert faults.rescaled(RISK)[0] == pytest.approx(1.0 / 1.5 / 0.8, rel=0.02)
+
+
+def test_slip_since_the_map_has_verified_a_pose_is_remembered():
+    assert drive(lambda o, t: (o, o))[0].slipped < 0.05
+    faults = drive(lambda o, t: (o + np.array([0.5, 0.0, 0.0]) * (t < 10.4), o))[0]
+    assert faults.odometry < 0.1  # it is over
+    assert faults.slipped > 100.0
+    faults.trusted()
+    assert faults.slipped < 0.1
