@@ -30,6 +30,7 @@ _LAYOUTS = (
     "poses.txt, SC-LIO-SAM's Scans/*.pcd with times.txt and odom_poses.txt, MulRan's folders, a drive of KITTI's raw "
     "data, or a ROS recording (rosbag2 directory, .mcap, .db3, .bag)"
 )
+_GIVE_RUN = "no run; give the run here (a folder, .mcap, .db3 or .bag), after the map if the command takes one"
 
 
 @dataclass(frozen=True)
@@ -54,6 +55,8 @@ def find_layout(path: Path) -> Layout:
         remedy = f"did you mean {path.parent / near[0]}?" if near else "check the path"
         raise RunError(f"{path}: no such file or directory; {remedy}")
     if path.is_file():
+        if (kind := {".coview": "a map", ".tum": "a trajectory"}.get(path.suffix)) is not None:
+            raise RunError(f"{path}: is {kind}, {_GIVE_RUN}")
         if suffix_of(path) not in CLOUD_SUFFIXES:
             raise RunError(f"{path}: neither a run nor a cloud ({', '.join(sorted(CLOUD_SUFFIXES))})")
         return Layout(path, (path,))
@@ -73,6 +76,8 @@ def find_layout(path: Path) -> Layout:
             raise RunError(f"{path}: is no run; did you mean {within}?")
     if any(is_cloud_name(file) for file in path.iterdir()):
         raise RunError(f"{path}: clouds lie in the directory itself; a run has {_LAYOUTS}")
+    if (path / "manifest.json").exists():  # a site's
+        raise RunError(f"{path}: is a map, {_GIVE_RUN}")
     raise RunError(f"{path}: no frames/ directory; a run has {_LAYOUTS}")
 
 
