@@ -179,6 +179,9 @@ def test_run_that_does_not_exist_is_answered_by_its_neighbour(run):
     with pytest.raises(RunError, match=f"no such file or directory; did you mean {run}") as caught:
         open_run(run.with_name(f"{run.name}s"))
     assert "odom_poses.txt" not in str(caught.value)
+    run.with_name("monday.mcap").touch()
+    with pytest.raises(RunError, match="check the path"):
+        open_run(run.with_name("garage.mcap"))
 
 
 def test_duplicate_frames_and_broken_links_are_refused(run):
