@@ -76,12 +76,19 @@ def warn(message: str | None) -> None:
         warnings.warn(message, CoViewWarning, stacklevel=3)
 
 
-def did_you_mean(given: str, known: Sequence[str]) -> str:
-    """Return the end of a message about an unknown name: the nearest known one, or all."""
+def nearest(given: str, known: Sequence[str]) -> str | None:
+    """Return the known name that is most similar to a mistyped one; None if none is similar."""
     from difflib import get_close_matches
 
-    near = get_close_matches(given, known, 1)
-    return f"did you mean {near[0]!r}?" if near else f"there are {', '.join(known)}"
+    bare = {name.lstrip("-"): name for name in known}  # dashes of options are no similarity
+    near = get_close_matches(given.lstrip("-"), bare, 1, cutoff=0.65)  # at 0.6 merge is serve
+    return bare[near[0]] if near else None
+
+
+def did_you_mean(given: str, known: Sequence[str]) -> str:
+    """Return the end of a message about an unknown name: the nearest known one, or all."""
+    near = nearest(given, known)
+    return f"did you mean {near!r}?" if near else f"there are {', '.join(known)}"
 
 
 PIP_INSTALL = f"{shlex.quote(sys.executable or 'python')} -m pip install"

@@ -45,7 +45,7 @@ _MODULES = {"eval": "evaluate", "serve-map": "serve_map"}  # a module called eva
 _COMPLETE_FILE = {"bash": "_shtab_compgen_files", "zsh": "_files", "fish": "(__fish_complete_path (commandline -ct))"}
 """File name completion, which ``shtab coview_stream.cli.build_parser`` reads from an argument."""
 
-_MEANT = {"--unit": "--crs", "--units": "--crs", "--feet": "--crs", "--lidar": "--sensor"}
+_MEANT = {"--unit": "--crs", "--units": "--crs", "--feet": "--crs", "--lidar": "--sensor", "--topic": "--cloud-topic"}
 """Options that people try, and the ones that they mean."""
 
 _EXTRAS = {"build": "build", "airborne": "build", "simulate": "build", "demo": "all", "train": "learn-train"}

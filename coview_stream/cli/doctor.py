@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING
 
 from coview_stream.cli.map_argument import add_map, local_map
 from coview_stream.cli.options import add_network, add_shared, check_codec, mount_of
-from coview_stream.errors import ConfigError, CoViewError, TransportError
+from coview_stream.errors import ConfigError, CoViewError, TransportError, counted
 
 if TYPE_CHECKING:
     from coview_stream.doctor.finding import Finding
@@ -62,9 +62,18 @@ def run(args: argparse.Namespace) -> int:
             print(finding.line(), flush=True)  # the next finding may take seconds
     if args.json:
         print(json.dumps({"format": 1, "findings": [finding.to_json() for finding in findings]}, indent=1))
-    elif any(finding.verdict != "ok" for finding in findings):
-        print("by symptom, with what to do: `coview-stream help reasons`")
+    else:
+        print(_conclusion(findings))
     return 1 if failed(findings) else 0
+
+
+def _conclusion(findings: list[Finding]) -> str:
+    """Return the last line: all is well, or how many problems and warnings there are, and the page about them."""
+    problems, warnings = (sum(finding.verdict == verdict for finding in findings) for verdict in ("FAIL", "warn"))
+    if not problems + warnings:
+        return "all is well"
+    count = f"{counted(problems, 'problem')}, {counted(warnings, 'warning')}"
+    return f"{count}; by symptom, with what to do: `coview-stream help reasons`"
 
 
 def _robot_keys(args: argparse.Namespace) -> list[RobotKeys]:

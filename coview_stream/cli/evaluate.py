@@ -45,7 +45,8 @@ def run(args: argparse.Namespace) -> int:
 
         errors = frame_errors(estimate, truth)
         plot_errors(errors.distance, errors.e_t, errors.e_r, args.plot)
-    print(evaluation.to_json() if args.json else table(evaluation))
+    compared = f"{'compared':<18} {args.estimate}, with the truth in {args.truth}"  # the files are easily swapped
+    print(evaluation.to_json() if args.json else f"{compared}\n{table(evaluation)}")
     if evaluation.false_frames > evaluation.posed / 2 and (offset := constant_offset(estimate, truth)):
         print(f"{args.truth}: {offset}", file=sys.stderr)
     return 0

@@ -247,7 +247,10 @@ def _ros_parameters(args: argparse.Namespace, declared: argparse.ArgumentParser)
 
 def serve_options(args: argparse.Namespace, tables: dict[str, dict[str, Any]]) -> ServeOptions:
     """Return the node's options from complete arguments and the tables of ``--config``, see :func:`settings`."""
+    from coview_stream.basemap.file_format import load
+    from coview_stream.basemap.joined import JOINED_SUFFIX
     from coview_stream.basemap.signature import read_verify_key
+    from coview_stream.basemap.site.site_grid import PART_SUFFIX
     from coview_stream.config import LocalizerConfig
     from coview_stream.config.odometry import LidarOdometryConfig
     from coview_stream.config.settings_file import with_table
@@ -299,6 +302,8 @@ def serve_options(args: argparse.Namespace, tables: dict[str, dict[str, Any]]) -
     by_default = not (args.connect or args.listen or args.zenoh_config)
     compose(args.connect or (), args.listen or (), args.zenoh_config)  # mistakes before anything is fetched or written
     opened = open_map_argument(args)
+    if opened.path.is_file() and opened.path.suffix not in (JOINED_SUFFIX, PART_SUFFIX):
+        load(opened.path, check=False)  # no map: refused before a folder is made; its bytes are checked when it opens
     options = ServeOptions(
         map_path=opened.path,
         keys=keys,

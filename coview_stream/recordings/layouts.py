@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from difflib import get_close_matches
 from itertools import pairwise
 from pathlib import Path
 
@@ -12,7 +11,7 @@ import numpy as np
 from coview_stream.clouds.files import CLOUD_SUFFIXES, is_cloud_name
 from coview_stream.clouds.rows import suffix_of
 from coview_stream.clouds.trajectory import columns_of, read_kitti_poses, read_times, read_tum
-from coview_stream.errors import RunError
+from coview_stream.errors import RunError, nearest
 from coview_stream.geometry.arrays import Floats
 from coview_stream.geometry.transforms import Pose, Poses, inverse
 
@@ -30,6 +29,7 @@ _LAYOUTS = (
     "poses.txt, SC-LIO-SAM's Scans/*.pcd with times.txt and odom_poses.txt, MulRan's folders, a drive of KITTI's raw "
     "data, or a ROS recording (rosbag2 directory, .mcap, .db3, .bag)"
 )
+_GIVE_RUN = "no run; give the run here (a folder, .mcap, .db3 or .bag), after the map if the command takes one"
 
 
 @dataclass(frozen=True)
@@ -49,11 +49,13 @@ class Layout:
 def find_layout(path: Path) -> Layout:
     """Find the files of a run, a directory or a cloud file; RunError if missing, of unknown layout, without frames."""
     if not path.exists():
-        beside = [other.name for other in path.parent.iterdir()] if path.parent.is_dir() else []
-        near = get_close_matches(path.name, beside, 1)
-        remedy = f"did you mean {path.parent / near[0]}?" if near else "check the path"
+        beside = {other.stem: other for other in path.parent.iterdir()} if path.parent.is_dir() else {}
+        near = nearest(path.stem, list(beside))  # a common suffix is no similarity
+        remedy = f"did you mean {beside[near]}?" if near else "check the path"
         raise RunError(f"{path}: no such file or directory; {remedy}")
     if path.is_file():
+        if (kind := {".coview": "a map", ".tum": "a trajectory"}.get(path.suffix)) is not None:
+            raise RunError(f"{path}: is {kind}, {_GIVE_RUN}")
         if suffix_of(path) not in CLOUD_SUFFIXES:
             raise RunError(f"{path}: neither a run nor a cloud ({', '.join(sorted(CLOUD_SUFFIXES))})")
         return Layout(path, (path,))
@@ -73,6 +75,8 @@ def find_layout(path: Path) -> Layout:
             raise RunError(f"{path}: is no run; did you mean {within}?")
     if any(is_cloud_name(file) for file in path.iterdir()):
         raise RunError(f"{path}: clouds lie in the directory itself; a run has {_LAYOUTS}")
+    if (path / "manifest.json").exists():  # a site's
+        raise RunError(f"{path}: is a map, {_GIVE_RUN}")
     raise RunError(f"{path}: no frames/ directory; a run has {_LAYOUTS}")
 
 

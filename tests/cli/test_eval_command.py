@@ -22,6 +22,7 @@ def test_eval_prints_table_and_json(truth, tmp_path, capsys):
     write_tum(estimate, 0.1 * np.arange(4, 10), [pose_from(np.eye(3), [k, 0.25, 0]) for k in range(4, 10)])
     assert main(["eval", str(estimate), str(truth)]) == 0
     out = capsys.readouterr().out
+    assert out.startswith(f"compared           {estimate}, with the truth in {truth}\n")
     assert "60.0% of 10 frames" in out
     assert "after 4.0 m" in out
     assert "mean 0.250" in out

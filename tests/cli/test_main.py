@@ -46,6 +46,11 @@ def test_misspelt_names_are_answered_by_the_nearest(argv, near, capsys):
     assert f"did you mean '{near}'?" in capsys.readouterr().err
 
 
+@pytest.mark.parametrize("argv", [["merge"], ["drive"], ["plot"], ["serve", "--verbose"], ["build", "--rviz"]])
+def test_names_without_similarity_are_answered_by_all(argv, refused):
+    assert "; there are " in refused(*argv)
+
+
 @pytest.mark.parametrize(("word", "page"), [("ros2", "`coview-stream help wire.md`"), ("nosuch", "there are demo, ")])
 def test_help_names_the_page_with_a_word_in_a_title_or_all(word, page, refused):
     assert page in refused("help", word)

@@ -62,10 +62,13 @@ def test_unusable_state_option_is_refused_at_once(world_file, tmp_path, refused)
 
 
 @pytest.mark.parametrize(
-    "wrong", [["--connect", "foo"], ["--listen", "foo"], ["--zenoh-config", "none.json5"], ["none.coview"]]
+    "wrong",
+    [["--connect", "foo"], ["--listen", "foo"], ["--zenoh-config", "none.json5"], ["none.coview"], ["bad.coview"]],
 )
-def test_nothing_is_made_or_logged_before_the_other_options_are_right(world_file, tmp_path, refused, wrong):
-    site = [] if wrong == ["none.coview"] else [world_file]
+def test_nothing_is_made_or_logged_before_map_and_options_are_right(world_file, tmp_path, monkeypatch, refused, wrong):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "bad.coview").write_text("no map")
+    site = [] if wrong[-1].endswith(".coview") else [world_file]
     assert wrong[-1] in refused("serve", *site, *wrong, "--state", tmp_path / "state", "--robot", "r1")
     assert not (tmp_path / "state").exists()
 

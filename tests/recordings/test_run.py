@@ -164,6 +164,9 @@ def test_binary_odometry_file_is_refused(run):
         (lambda d: write_cloud(d / "a.pcd", POINTS) or d, "in the directory itself"),
         (lambda d: (d / "a.mcap").touch() or d / "a.mcap", "seems to be empty.*copy or record"),
         (lambda d: (d / "metadata.yaml").touch() or d, r"cannot be read \(Invalid bag metadata.*reindex"),
+        (lambda d: (d / "a.coview").touch() or d / "a.coview", "is a map, no run; give the run here .*after the map"),
+        (lambda d: (d / "manifest.json").touch() or d, "is a map, no run; give the run here .*after the map"),
+        (lambda d: (d / "a.tum").touch() or d / "a.tum", "is a trajectory, no run; give the run here"),
         (lambda d: (d / "a.wrl").touch() or d / "a.wrl", "neither a run nor a cloud"),
     ],
 )
@@ -176,6 +179,9 @@ def test_run_that_does_not_exist_is_answered_by_its_neighbour(run):
     with pytest.raises(RunError, match=f"no such file or directory; did you mean {run}") as caught:
         open_run(run.with_name(f"{run.name}s"))
     assert "odom_poses.txt" not in str(caught.value)
+    run.with_name("monday.mcap").touch()
+    with pytest.raises(RunError, match="check the path"):
+        open_run(run.with_name("garage.mcap"))
 
 
 def test_duplicate_frames_and_broken_links_are_refused(run):

@@ -28,7 +28,7 @@ _COLUMNS = (
     ("y", 13),
     ("z", 9),
     ("yaw deg", 8),
-    ("within m", 9),
+    ("within xy/z m", 13),
     ("age s", 6),
     ("Hz", 5),
     ("wrong", 15),
@@ -121,8 +121,9 @@ def _row(view: RobotView, now: float) -> list[str]:
     cells, rate = ["-"] * 6, f"{view.pose_rate(now):.1f}"
     if pose is not None:
         cells = [f"{value:.2f}" for value in pose.T_map_body[:3, 3]]
-        level = None if pose.protection is None else pose.protection.metres
-        cells += [f"{math.degrees(yaw_of(pose.T_map_body)):.1f}", _number(level, 2), _number(pose.age, 2)]
+        level = pose.protection
+        within = "-" if level is None else f"{_number(level.horizontal, 2)}/{_number(level.vertical, 2)}"
+        cells += [f"{math.degrees(yaw_of(pose.T_map_body)):.1f}", within, _number(pose.age, 2)]
     says = _mapping(view.status, "calibration").get("says")  # the node's remarks on sensor and odometry
     reasons = [
         f"on map {view.status['map']}" if isinstance(view.status.get("map"), str) else "",

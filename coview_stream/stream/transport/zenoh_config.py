@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import difflib
 import json
 import re
 from collections.abc import Iterator, Sequence
@@ -10,7 +9,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
-from coview_stream.errors import TransportError
+from coview_stream.errors import TransportError, nearest
 from coview_stream.stream.transport.error_guard import is_panic
 
 _PROTOCOLS = ("tcp", "udp", "tls", "quic", "ws", "unixsock-stream", "unixpipe", "serial", "vsock")
@@ -205,6 +204,6 @@ def _shortened(text: str) -> str:
     if field is None:
         return line + text
     place = _PLACE.search(text)
-    near = difflib.get_close_matches(field[1], re.findall(r"`([^`]+)`", field[2] or ""), 1)
+    near = nearest(field[1], re.findall(r"`([^`]+)`", field[2] or ""))
     line += f"line {place[1]}: " if place else ""
-    return f"{line}unknown key {field[1]!r}" + (f"; did you mean {near[0]!r}?" if near else "; take it out")
+    return f"{line}unknown key {field[1]!r}" + (f"; did you mean {near!r}?" if near else "; take it out")

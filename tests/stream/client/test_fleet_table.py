@@ -39,7 +39,7 @@ def test_tracking_robot_shows_its_pose(fleet):
     assert header.split()[:6] == ["robot", "state", "x", "y", "z", "yaw"]
     assert line.split() == [
         *("r1", "TRACKING", "412000.12", "5318000.46", "7.89", "30.0"),
-        *("0.35", "0.12", "10.0", "1", "in", "14", "31/89", "4", "all", "well"),
+        *("0.20/0.10", "0.12", "10.0", "1", "in", "14", "31/89", "4", "all", "well"),
     ]
 
 

@@ -302,6 +302,16 @@ def test_bad_clouds_are_counted_named_once_and_give_no_pose(robot, site, caplog)
     assert not robot.poses
 
 
+def test_diagnostics_have_the_level_in_space_in_the_plane_and_in_height():
+    level = {"m": 0.41, "deg": 1.0, "horizontal_m": 0.12, "vertical_m": 0.4}
+    status = {"state": "TRACKING", "reason": "", "robot": "r1", "map_sha256": "ab"}
+    status["pose"] = {"protection_level": level, "rate_hz": 10.0, "age_s": 0.1, "confidence": 0.9}
+    payload = ros2_outputs.encode_diagnostics(status, ns(1.0), "", "")
+    rows = ros2.read(payload, ros2_outputs.DIAGNOSTICS).status[0].values
+    levels = {row.key: row.value for row in rows if row.key.startswith("protection_")}
+    assert levels == {"protection_m": "0.41", "protection_horizontal_m": "0.12", "protection_vertical_m": "0.4"}
+
+
 @pytest.mark.slow
 def test_map_is_published_again_until_it_is_the_one_that_is_served(robot, monkeypatch):
     monkeypatch.setattr(ros2_transport, "RETRY", 0.0)
