@@ -386,7 +386,9 @@ def summary(located: RunResult) -> str:
     if posed:
         x, y, z = np.asarray(posed[-1].T_map_body)[:3, 3]
         level = posed[-1].protection
-        within = "" if level is None or not located.trusted else f", within {level.metres:.2f} m but for 1 in 1,000"
+        within = ""
+        if level is not None and located.trusted:
+            within = f", within {level.horizontal:.2f} m, in height {level.vertical:.2f} m, but for 1 in 1,000"
         lines.append(f"{'last position':<18} {x:.3f} {y:.3f} {z:.3f} m{within}")
         where = "" if located.driven is None else f"after {located.driven:.1f} m: "
         lines.append(f"{'found':<18} {where}wrong {one_in(1.0 - posed[0].confidence)}")

@@ -77,7 +77,8 @@ def test_summary_has_state_place_and_time(located):
     assert "TRACKING" in text
     assert f"{len(located.posed)} of 7 frames" in text
     assert "step time" in text
-    assert f"m, within {located.posed[-1].protection.metres:.2f} m but for 1 in 1,000" in text
+    level = located.posed[-1].protection
+    assert f"m, within {level.horizontal:.2f} m, in height {level.vertical:.2f} m, but for 1 in 1,000" in text
     nothing = RunResult(3, [Fix(0.0, State.SEARCHING)], skipped=["000001.ply: empty"])
     assert "0 of 3 frames" in summary(nothing)
     assert "000001.ply: empty" in summary(nothing)
