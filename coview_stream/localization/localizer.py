@@ -13,7 +13,7 @@ from coview_stream.basemap.basemap import BaseMap
 from coview_stream.config import LocalizerConfig
 from coview_stream.errors import ConfigError, InputError
 from coview_stream.geometry.arrays import Reals
-from coview_stream.geometry.transforms import Pose, inverse, orthonormal, pose_from
+from coview_stream.geometry.transforms import Circle, Pose, inverse, orthonormal, pose_from
 from coview_stream.geometry.validation import validate_pose
 from coview_stream.localization.calibration.calibration import Calibration
 from coview_stream.localization.frame import FramePreparation, PreparedFrame
@@ -23,7 +23,7 @@ from coview_stream.localization.saved_state import SavedState
 from coview_stream.localization.search.acceptance import SearchResult
 from coview_stream.localization.search.advice import AdvisedSearch
 from coview_stream.localization.search.global_search import GlobalSearch
-from coview_stream.localization.search.hints import PlaceGuess, require_ground
+from coview_stream.localization.search.hints import PlaceGuess, require_ground, robot_position
 from coview_stream.localization.search.recognizers import SearchIndex
 from coview_stream.localization.search.request import LostPlace, SearchRequest
 from coview_stream.localization.search_requests import NoSearch, SearchRequests
@@ -214,6 +214,7 @@ class Localizer(SavedState):
         self._tracker.start(registration, newest.T_odom_body, result.travelled, result.T_odom_body)
         self._monitor.begin(min(1.0 - self._confidence, self.config.acceptance.risk))
         self._requests.place_accepted()
+        self._witness.faults.trusted()
         self._frames.forget_keyframe()
         # the robot may have driven on or been carried since the keyframe
         match = self._tracker.match_to_map(newest.cloud, newest.T_odom_body)
@@ -310,7 +311,8 @@ class Localizer(SavedState):
             if self.state.has_place and self._newest is not None:  # the robot was moved, or is still here
                 here = self._tracker.T_map_odom @ self._newest.T_odom_body
                 self._handle(Event.PLACE_GIVEN_UP)
-                self._requests.hints.odometry_begins_anew(here)
+                self._requests.hints.forget_lost()
+                self._requests.hints.robot_at(here)
             self._frames.begin_odometry()
             self._tracker.forget_odometry()
             self._witness.begin_odometry()
@@ -347,7 +349,7 @@ class Localizer(SavedState):
         if request is None:
             return frame, None
         if not isinstance(request, NoSearch):
-            return frame, replace(request, lost=self._lost_place(frame))
+            return frame, replace(request, lost=self._lost_place(frame, request.area))
         if request.cause is RejectionReason.ODOMETRY:
             self._frames.estimator.forget_leader()
             self._frames.forget_keyframe()
@@ -356,11 +358,11 @@ class Localizer(SavedState):
         self._evidence = KeyframeEvidence(stamp, self.state, request.reason, cause=request.cause)
         return frame, None
 
-    def _lost_place(self, frame: PreparedFrame) -> LostPlace | None:
-        """Return the last known place where odometry continues to a frame; None without one."""
+    def _lost_place(self, frame: PreparedFrame, area: Circle | None) -> LostPlace | None:
+        """Return the last known place where odometry continues to a frame; None without one, or if outside ``area``."""
         assert self._frames.anchor is not None  # a frame has been prepared
         T_map_odom = self._requests.hints.lost(self._frames.anchor)
-        if T_map_odom is None:
+        if T_map_odom is None or not (area is None or area.holds(robot_position(T_map_odom, frame.T_odom_body)).all()):
             return None
         odds = self._monitor.odds(frame.stamp, self._tracker.odometry.travelled) + self._witness.faults.slipped
         return LostPlace(T_map_odom, self._tracker.lost_covariance(T_map_odom @ frame.T_odom_body), odds)

@@ -64,6 +64,7 @@ class SearchRequests:
             hints = tuple(T for T in hints if area.holds(robot_position(T, frame.T_odom_body)).all())
         if self._odometry_check.contradicts(frame.scan.levelled(calibration), frame.scan.position):
             self._restart()
+            self.hints.forget_lost()
             reason = "searching anew: frames do not fit together where odometry puts them"
             return NoSearch(reason, RejectionReason.ODOMETRY)
         if keyframe is None:

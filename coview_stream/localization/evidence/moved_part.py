@@ -26,6 +26,7 @@ _PRIOR = 5e-4  # probability that a survey has a part of the site shifted as a w
 _LEAST = 2.0  # metres, least shift that unexplained structure shows
 FARTHEST_MOVED = 8.0
 """Metres, greatest shift of a moved part."""
+_BUILDING = 100.0  # metres, length of a large building, a part that moves as a whole
 _SAME = 2.5  # metres: nearer shifts explain the same points
 _PATCH = 3.0  # metres
 _TAKEN = 1.0  # metres from a point of the scan within which map structure is explained
@@ -54,7 +55,7 @@ def find_moved_part(field: kernels.FieldMap, scans: Sequence[ObservedScan], T_ma
     ``T_map_odom`` (4, 4) is the place, registered at the newest keyframe: its lean is the sensor's and turns with it.
     """
     shifts = _all_shifts()
-    ratios = _shift_ratios(field, _Seen.of(field, scans, T_map_odom), shifts)
+    ratios = _shift_ratios(field, SeenStructure.of(field, scans, T_map_odom), shifts)
     if ratios is None:
         return NO_PART
     best = int(ratios.argmax())
@@ -63,25 +64,26 @@ def find_moved_part(field: kernels.FieldMap, scans: Sequence[ObservedScan], T_ma
 
 
 def log_odds_of_moved(
-    field: kernels.FieldMap, scans: Sequence[ObservedScan], T_map_odom: Floats, T_map_other: Floats
+    field: kernels.FieldMap, scans: Sequence[ObservedScan], T_map_odom: Floats, T_map_other: Floats, metres: float
 ) -> float:
     """Return the log-odds of "the robot is at the other place, and structure that fits here has moved" to "it is here".
 
     Here is ``T_map_odom``; other arguments are as in :func:`find_moved_part`. The moved share of the view is unknown:
-    that it comprises all N patches that fit here alone has probability 1 / (N + 1). No part moves farther than
+    that it comprises all N patches that fit here alone has probability 1 / (N + 1), and that it extends over the
+    ``metres`` driven since the scans first fitted here falls with the length of a building. No part moves farther than
     :data:`FARTHEST_MOVED`.
     """
     here, other = scans[-1].poses(np.stack([T_map_odom, T_map_other]))
     shift = (other - here)[:2]
     if float(np.linalg.norm(shift)) > FARTHEST_MOVED:
         return -math.inf
-    seen, alone, ratios = _Seen.of(field, scans, T_map_odom).turned(float(other[3] - here[3])), 0.0, None
+    seen, alone, ratios = SeenStructure.of(field, scans, T_map_odom).turned(float(other[3] - here[3])), 0.0, None
     if len(seen.explained):
         there = kernels.near_structure(field, seen.explained, seen.place, shift[None])[0]
         alone = float((1.0 - _in_patches(seen.explained) @ there.astype(np.float64)).sum())
     if float(np.linalg.norm(shift)) >= _LEAST:
         ratios = _shift_ratios(field, seen, np.concatenate([_all_shifts(), shift[None]]))
-    return math.log(_PRIOR) - math.log1p(alone) + (0.0 if ratios is None else float(ratios[-1]))
+    return math.log(_PRIOR) - math.log1p(alone) - metres / _BUILDING + (0.0 if ratios is None else float(ratios[-1]))
 
 
 def _all_shifts() -> Floats:
@@ -92,7 +94,7 @@ def _all_shifts() -> Floats:
     return np.asarray(shifts[(length >= _LEAST) & (length <= FARTHEST_MOVED)])
 
 
-def _shift_ratios(field: kernels.FieldMap, seen: _Seen, shifts: Floats) -> Floats | None:
+def _shift_ratios(field: kernels.FieldMap, seen: SeenStructure, shifts: Floats) -> Floats | None:
     """Return the log-ratios (H,) of "unexplained structure belongs at this shift" against chance.
 
     None for too few points.
@@ -118,7 +120,7 @@ def _in_patches(points: Points) -> Floats:
 
 
 @dataclass(frozen=True)
-class _Seen:
+class SeenStructure:
     """The scans' structure, all (N, 3) relative to the body along the map's axes, at a place."""
 
     place: Floats  # (4,) x, y, z and 0
@@ -126,13 +128,13 @@ class _Seen:
     explained: Points  # a sample
     unexplained: Points  # a sample
 
-    def turned(self, angle: float) -> _Seen:
+    def turned(self, angle: float) -> SeenStructure:
         """Return the structure turned about the body by an angle, radians."""
         R = rot_z(angle).T.astype(np.float32)
-        return _Seen(self.place, self.structure @ R, self.explained @ R, self.unexplained @ R)
+        return SeenStructure(self.place, self.structure @ R, self.explained @ R, self.unexplained @ R)
 
     @classmethod
-    def of(cls, field: kernels.FieldMap, scans: Sequence[ObservedScan], T_map_odom: Floats) -> _Seen:
+    def of(cls, field: kernels.FieldMap, scans: Sequence[ObservedScan], T_map_odom: Floats) -> SeenStructure:
         """Look at scans, newest last, from a place ``T_map_odom`` (4, 4)."""
         place = scans[-1].poses(T_map_odom[None])[0]
         place[3] = 0.0
@@ -163,7 +165,7 @@ def _sample(points: Points) -> Points:
     return points
 
 
-def _explained(field: kernels.FieldMap, seen: _Seen, shifts: Floats) -> Floats:
+def _explained(field: kernels.FieldMap, seen: SeenStructure, shifts: Floats) -> Floats:
     """Return (H, N): 1 where an unexplained point, at a shift (H, 2), is near unexplained map structure."""
     explained = kernels.near_structure(field, seen.unexplained, seen.place, shifts)
     shift, point = np.nonzero(explained)

@@ -164,10 +164,8 @@ class GlobalSearch:
         if leader is not None:
             scored = self._gathered(scored, leader, scan, request)
             scans = [scan] if reading.leans else [*self._scorer.scans[:-1], scan]
-            scored = weighed_by_odometry(
-                scored, leader, request, scans, self.base_map, self.config, reading.scorer.beside
-            )
-            if scored.error < self.config.acceptance.risk:
+            context = request, scans, self.base_map, self.config, reading.scorer
+            if weighed_by_odometry(scored, leader, *context).error < self.config.acceptance.risk:
                 place = scored.places[0]
                 modes = find_modes(
                     place, leader, scan, request, self.base_map, self.config, self._local_maps, reading.scorer.beside
@@ -175,6 +173,7 @@ class GlobalSearch:
                 leader, undecided = modes.best, modes.undecided
                 if not undecided:
                     scored = scored.beside(self._registered_rivals(replace(reading, scored=scored), leader))
+            scored = weighed_by_odometry(scored, leader, *context)  # may be another pose than before
             if scored.error < 0.5:  # a stated error has to be true even if nothing follows from it
                 scored = scored.doubted(find_moved_part(self.base_map.field, scans, leader.T_map_odom))
         result = decide(scored, leader, request, self.config.acceptance, undecided)

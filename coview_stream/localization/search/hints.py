@@ -219,10 +219,9 @@ class PoseHints:
         self._awaited, self._known = (), (self._lost,)
         self.forget_leader()
 
-    def odometry_begins_anew(self, T_map_body: Pose) -> None:
-        """Hint that the robot is at ``T_map_body`` (4, 4) at the next frame, to which odometry did not lead."""
+    def forget_lost(self) -> None:
+        """Keep the lost place as a mere hint, as odometry does not lead from there."""
         self._lost = None
-        self.robot_at(T_map_body)
 
     def lost(self, anchor: Floats) -> Pose | None:
         """Return the lost place as ``T_map_odom`` about ``anchor`` (3,); None without one that odometry continues."""

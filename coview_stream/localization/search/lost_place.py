@@ -23,36 +23,46 @@ from coview_stream.localization.evidence.moved_part import FARTHEST_MOVED, log_o
 from coview_stream.localization.evidence.observation import ObservedScan
 from coview_stream.localization.registration.register import registration_covariance
 from coview_stream.localization.search.consensus import Hypothesis
-from coview_stream.localization.search.places import Scored
-from coview_stream.localization.search.refinement import Beside
-from coview_stream.localization.search.request import SearchRequest
+from coview_stream.localization.search.places import BASIN_ANGLE, BASIN_DISTANCE, Scored
+from coview_stream.localization.search.request import SearchRequest, same_place
+from coview_stream.localization.search.scoring import PlaceScorer
+
+_LEVEL = [3, 4, 5, 2]  # x, y, z and heading of (rx, ry, rz, x, y, z)
+_HEIGHT = 0.5  # metres, sigma of the ground's height against the survey's: grass, snow, dug ground
 
 
 def weighed_by_odometry(
     scored: Scored, leader: Hypothesis, request: SearchRequest, scans: Sequence[ObservedScan], base_map: BaseMap,
-    config: LocalizerConfig, beside: Beside,
+    config: LocalizerConfig, scorer: PlaceScorer,
 ) -> Scored:  # fmt: skip
     """Return a keyframe's places, of which the first is registered as ``leader``, weighed by the request's lost place.
 
-    ``scans`` are the keyframes, newest last; their evidence is that of ``beside``.
+    ``scans`` are the newest keyframes, newest last; their evidence is that of ``scorer``.
     """
     lost = request.lost
     if lost is None or leader.registration is None:
         return scored
-    gap = boxminus(lost.T_map_odom @ request.T_odom_body, leader.T_map_odom @ request.T_odom_body)
-    shift = gap[3:5]
-    spread = lost.covariance + registration_covariance(leader.registration.information, config.registration)
-    distance = float(shift @ np.linalg.solve(spread[3:5, 3:5], shift))
+    body, end = request.T_odom_body, lost.T_map_odom @ request.T_odom_body
+    at = [leader.T_map_odom, *(place.T_map_odom for place in scored.places[1:])]
+    gaps = np.array([boxminus(end, T @ body) for T in at])
+    registered = registration_covariance(leader.registration.information, config.registration)
+    spread = lost.covariance + registered + np.diag([0.0, 0.0, 0.0, 0.0, 0.0, _HEIGHT**2])
+    distance = np.einsum(
+        "ki,ki->k", gaps[:, _LEVEL], np.linalg.solve(spread[np.ix_(_LEVEL, _LEVEL)], gaps[:, _LEVEL].T).T
+    )
     # densities by odometry's drift, in multiples of that of a slip, which is even within the reach of moved parts
     there = math.pi * FARTHEST_MOVED**2 / math.sqrt(float(np.linalg.det(2.0 * np.pi * spread[3:5, 3:5])))
-    here = there * math.exp(-0.5 * distance)
-    scored = scored.confirmed(min(here, 1.0) / lost.odds)
-    metres, degrees = float(np.linalg.norm(shift)), math.degrees(abs(gap[2]))
-    if metres <= 0.5 * ALERT_METRES and degrees <= 0.5 * ALERT_DEGREES:
+    density = there * np.exp(-0.5 * distance)
+    first = np.array([k == 0 or same_place(T, at[0], request, BASIN_DISTANCE, BASIN_ANGLE) for k, T in enumerate(at)])
+    scored = scored.weighed(np.minimum(density, 1.0) / lost.odds, first)
+    metres, radians = np.linalg.norm(gaps[:, 3:], axis=1), np.abs(gaps[:, 2])
+    at_end = (metres <= 0.5 * ALERT_METRES) & (radians <= math.radians(0.5 * ALERT_DEGREES))
+    if at_end[0]:
         return scored  # both may be right
-    ratios = beside(np.stack([leader.T_map_odom, lost.T_map_odom]))
-    right = log_odds_of_moved(base_map.field, scans, leader.T_map_odom, lost.T_map_odom)
-    if distance > chi2_quantile(2, config.acceptance.risk):  # else these are modes of one place
-        right = float(np.logaddexp(right, math.log(there) + ratios[1] - ratios[0]))
-    odds = math.exp(min(right, 100.0)) / (here + lost.odds)
-    return scored.beside([Hypothesis(lost.T_map_odom, ratio=float(ratios[1]), probability=odds)])
+    right = log_odds_of_moved(base_map.field, scans, at[0], lost.T_map_odom, scorer.extent)
+    apart = distance[0] > chi2_quantile(len(_LEVEL), config.acceptance.risk)  # else both are modes of one place
+    if apart and not (at_end & ~first).any():  # it is not weighed yet
+        here, beside = scorer.beside(np.stack([at[0], lost.T_map_odom]))
+        right = float(np.logaddexp(right, math.log(there) + beside - here))
+    odds = math.exp(min(right, 100.0)) / (density[0] + lost.odds)
+    return scored.beside([Hypothesis(lost.T_map_odom, probability=float(odds))])

@@ -79,15 +79,21 @@ class Scored:
             second=max(rivals, key=lambda place: place.probability),
         )  # fmt: skip
 
-    def confirmed(self, odds: float) -> Scored:
-        """Add knowledge that puts the robot at the first place; ``odds`` are those it would have without the scans."""
-        share = 1.0 / (1.0 + (1.0 - self.error) * odds)
-        places = [replace(place, probability=share * place.probability) for place in self.places]
-        places[0] = replace(places[0], probability=(1.0 + odds) * places[0].probability)
-        second = next((k for k, place in enumerate(self.places) if place is self.second), None)
+    def weighed(self, odds: Floats, first: Bools) -> Scored:
+        """Add knowledge that gives places (P,) prior odds beside their own; ``first`` (P,) are poses of the first."""
+        gain = np.where(first, 1.0 + odds[0], 1.0 + odds)
+        probability = np.array([place.probability for place in self.places])
+        right = (1.0 + odds[0]) * (1.0 - self.error)
+        wrong = self.error + float((odds * probability)[~first].sum())
+        places = [
+            replace(place, probability=place.probability * factor)
+            for place, factor in zip(self.places, (gain / (right + wrong)).tolist(), strict=True)
+        ]
+        others = [place for place, its in zip(places, first.tolist(), strict=True) if not its]
+        second = max(others, key=lambda place: place.probability, default=None)
         return replace(
-            self, places=places, error=share * self.error, none=share * self.none,
-            second=None if second is None else places[second],
+            self, places=places, error=wrong / (right + wrong), none=self.none / (right + wrong),
+            second=None if self.second is None else second,
         )  # fmt: skip
 
     def doubted(self, moved: MovedPart) -> Scored:

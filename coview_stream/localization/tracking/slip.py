@@ -20,7 +20,7 @@ from coview_stream.localization.evidence.observation import ObservedScan
 from coview_stream.localization.registration.clouds import LocalMap
 from coview_stream.localization.tracking.place_evidence import PlaceEvidence
 
-_VIEWS = 8  # newest views in which a moved part is searched for
+_VIEWS = 4  # newest views in which a moved part is searched for
 
 
 def off_by(T_map_body: Pose, T_map_other: Pose) -> tuple[float, float]:
@@ -55,6 +55,7 @@ class Dispute:
         self._before = np.zeros(0)  # log-likelihood ratios of the earlier views
         self._newest = np.zeros(0)  # and of the current one
         self._begun = -math.inf  # metres driven at the start of the view
+        self._since = math.inf  # metres driven at the first view
         self._scans: list[ObservedScan] = []  # the newest of each view
 
     def settle(
@@ -68,7 +69,7 @@ class Dispute:
         clouds alone, that odometry has slipped.
         """
         if travelled - self._begun >= self._view:
-            self._begun = travelled
+            self._begun, self._since = travelled, min(self._since, travelled)
             self._before = self._before + self._newest
             self._scans = [*self._scans, scan][-_VIEWS:]
         self._scans[-1] = scan
@@ -80,15 +81,19 @@ class Dispute:
         np.maximum.at(self._newest, owners, ratios[len(self._poses) :])
         total, here = self._before + self._newest, [T @ scan.T_odom_body for T in self._poses]
         total[0] -= math.log(slipped)
-        if best := int(total.argmax()):  # or odometry is right, and what fits here has moved
-            moved = self._place.log_odds_of_moved(self._scans, self._poses[best], self._poses[0])
-            total[0] = np.logaddexp(total[0], total[best] + moved - math.log(slipped))
-            best = int(total.argmax())
+        best = int(total.argmax())
         # a place near the best one contradicts it only if it is odometry's
         apart = np.array([k == 0 or matters(*off_by(T, here[best])) for k, T in enumerate(here)])
-        if best == 0 or total[best] - np.logaddexp.reduce(total[apart]) < -math.log(risk):
-            return None
-        return here[best]
+
+        def leads() -> bool:
+            return best != 0 and float(total[best] - np.logaddexp.reduce(total[apart])) >= -math.log(risk)
+
+        if leads():  # or odometry is right, and what fits here has moved
+            moved = self._place.log_odds_of_moved(
+                self._scans, self._poses[best], self._poses[0], travelled - self._since
+            )
+            total[0] = np.logaddexp(total[0], total[best] + moved - math.log(slipped))
+        return here[best] if leads() else None
 
     def _assign(self, T_map_predicted: Pose, T_map_seen: Sequence[Pose], T_odom_body: Pose) -> list[int]:
         """Return the nearest candidate of each registered pose, moved there; a pose far from all becomes a new one."""

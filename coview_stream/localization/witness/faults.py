@@ -299,7 +299,7 @@ class FaultPosterior:
             return
         self.slip, self.repeated, self.mixed = new_slip / total, new_repeated / total, new_mixed / total
         self.stopped = new_stopped / total
-        self.astray += (1.0 - self.astray) * (self.slip + self.stopped)
+        self.suspect(begins if step.clouds is None else self.slip + self.stopped)  # the map's part is no evidence here
         self.steady, self.growing = np.maximum(steady, 0.0) / total, growing / total
         self.moved = [replace(h, weight=h.weight / total) for h in moved]
         self.scaled = [replace(h, weight=h.weight / total) for h in scaled]
@@ -310,6 +310,14 @@ class FaultPosterior:
             metres = float(np.linalg.norm(step.clouds.motion[:2]))
             moves = metres > 3.0 * math.sqrt(float(step.clouds.covariance[0, 0]))  # else both stand still and agree
             self._moved_on = self._moved_on + metres if moves and self.stopped > _NEGLIGIBLE else 0.0
+
+    def suspect(self, probability: float) -> None:
+        """Add the ``probability`` that odometry has gone wrong in one more step."""
+        self.astray += (1.0 - self.astray) * probability
+
+    def unseen(self, metres: float) -> None:
+        """Add ``metres`` of odometry that no clouds were compared over."""
+        self.suspect(1.0 - math.exp(-_SLIPS * metres))
 
     def trusted(self) -> None:
         """Take odometry as right so far, as the map has verified a pose by it."""

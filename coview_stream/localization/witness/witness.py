@@ -97,6 +97,8 @@ class Witness:
 
     def forget_scan(self) -> None:
         """Keep the next frame from comparison with earlier ones, as its scan is about another origin."""
+        if self._reference is not None and self._newest is not None:
+            self.faults.unseen(float(np.linalg.norm((self._newest.path - self._reference.path)[:2])))
         self._reference = self._previous = self._newest = self._waiting = self._cloud = None
 
     def begin_odometry(self) -> None:
@@ -213,6 +215,8 @@ class Witness:
         waiting, self._waiting = self._waiting, None
         if waiting is not None:
             self._compare(waiting.now, waiting.middle, drift, waiting.registered, waiting.belief)
+            if waiting.registered is not None:
+                self.faults.trusted()  # the map had verified the pose at the step's end
         return waiting is not None
 
     def _compare(

@@ -8,7 +8,13 @@ from trackers import observed
 
 import coview_kernels as kernels
 from coview_stream.geometry.transforms import exp_so3, inverse, pose_from, rot_z, transform
-from coview_stream.localization.evidence.moved_part import NO_PART, MovedPart, _Seen, find_moved_part, log_odds_of_moved
+from coview_stream.localization.evidence.moved_part import (
+    NO_PART,
+    MovedPart,
+    SeenStructure,
+    find_moved_part,
+    log_odds_of_moved,
+)
 from coview_stream.localization.evidence.observation import ObservedScan
 
 ODOM = pose_from(rot_z(-0.7), [12.0, 40.0, 3.0])  # map <- odometry
@@ -71,7 +77,7 @@ def test_lean_of_the_sensor_leaves_nothing_unexplained(world_map, world_drive):
     """It turns with the body, and is the registered pose's against odometry's vertical."""
 
     def left(T_map_odom, *scans):
-        return len(_Seen.of(world_map.field, scans, T_map_odom).unexplained)
+        return len(SeenStructure.of(world_map.field, scans, T_map_odom).unexplained)
 
     lean, clouds = pose_from(exp_so3([np.radians(4.0), 0.0, 0.0]), np.zeros(3)), world_drive.clouds
     T = [inverse(ODOM) @ world_drive.T_map_body[frame] for frame in (9, 5, 0)]
@@ -100,11 +106,11 @@ def test_few_points_say_nothing(world_map, seen):
     assert found(world_map, replace(seen, many=replace(seen.many, points=few))) == NO_PART
 
 
-def log_odds(world_map, scan, metres, degrees=0.0):
+def log_odds(world_map, scan, metres, degrees=0.0, driven=0.0):
     """That the scan fits where it was taken only since the map's objects have moved, and that it was so far beside."""
     body = ODOM @ scan.T_odom_body
     beside = pose_from(rot_z(np.radians(degrees)) @ body[:3, :3], body[:3, 3] + [metres, 0.0, 0.0])
-    return log_odds_of_moved(world_map.field, [scan], ODOM, beside @ inverse(scan.T_odom_body))
+    return log_odds_of_moved(world_map.field, [scan], ODOM, beside @ inverse(scan.T_odom_body), driven)
 
 
 def test_view_moved_as_a_whole_only_if_all_of_it_did(world_map, seen):
@@ -116,6 +122,7 @@ def test_view_moved_as_a_whole_only_if_all_of_it_did(world_map, seen):
     assert whole < np.log(5e-4) - np.log(5.0)
     assert part > whole + 5.0
     assert log_odds(world_map, seen, -9.0) == -np.inf
+    assert log_odds(world_map, seen, -4.0, driven=200.0) < whole - 1.0  # no building is as long
 
 
 def test_same_pose_but_for_its_heading_shows_other_objects_moved(world_map, seen):

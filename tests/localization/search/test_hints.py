@@ -144,6 +144,9 @@ def test_hints_stay_at_the_places_that_they_named_before_a_jump():
     T_map_odom = pose_from(rot_z(0.3), [5.0, 1.0, 0.0])
     kept.odometry_continues(T_map_odom, anchor)
     np.testing.assert_allclose(kept.lost(anchor), T_map_odom, atol=1e-9)
+    kept.forget_lost()
+    assert kept.lost(anchor) is None
+    kept.odometry_continues(T_map_odom, anchor)
     kept.guess(PlaceGuess(0.0, 0.0, within=60.0))
     kept.guessed(np.zeros(3), anchor, T_odom_body)
     kept.odometry_jumped(anchor, T_odom_body)

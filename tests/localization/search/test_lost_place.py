@@ -6,9 +6,10 @@ import numpy as np
 import pytest
 from made_up_places import candidate, place
 from test_global_search import T_MAP_ODOM, off, run_of, searching
+from trackers import observed
 
 from coview_stream.config import LocalizerConfig
-from coview_stream.geometry.transforms import inverse, pose_from
+from coview_stream.geometry.transforms import inverse, pose_from, rot_z
 from coview_stream.localization.search.lost_place import weighed_by_odometry
 from coview_stream.localization.search.places import Rivals, Scored
 from coview_stream.localization.search.request import LostPlace
@@ -27,22 +28,45 @@ def request_(world_drive):
     return next(run_of(world_drive, 1))
 
 
-def error(world_map, request, alone=0.1):
-    """Probability that the robot is not at the truth, where the scans alone say ``alone``."""
-    first, second = place(1.0 - alone, T_MAP_ODOM), place(0.5 * alone, pose_from(np.eye(3), [50.0, 0.0, 0.0]))
-    scored = Scored(Rivals(), [first, second], alone, 0.5 * alone, 1e-3, second)
-    out = weighed_by_odometry(scored, candidate(first), request, [], world_map, LocalizerConfig(), np.zeros)
+class Silent:
+    """A scorer by which all poses explain the keyframes equally."""
+
+    extent = 0.0
+
+    def beside(self, poses):
+        return np.zeros(len(poses))
+
+
+def weighed(world_map, request, others=(), alone=0.1):
+    """The places of a search whose first is the truth, wrong with probability ``alone`` by the scans, and others."""
+    second = place(0.5 * alone, pose_from(np.eye(3), [50.0, 0.0, 0.0]) @ T_MAP_ODOM)
+    places = [place(1.0 - alone - sum(each.probability for each in others), T_MAP_ODOM), *others, second]
+    error = alone + sum(each.probability for each in others)
+    scored = Scored(Rivals(), places, error, 0.5 * alone, 1e-3, places[1])
+    scans = [observed(request.cloud, request.T_odom_body)]
+    out = weighed_by_odometry(scored, candidate(places[0]), request, scans, world_map, LocalizerConfig(), Silent())
     assert out.none + sum(each.probability for each in out.places) == pytest.approx(1.0)
-    assert out.second is out.places[1]
-    return out.error
+    return out
 
 
 def test_path_that_leads_to_the_first_place_confirms_it(world_map, request_):
-    assert error(world_map, request_) == 0.1
-    assert error(world_map, lost(request_, 0.05, 1e-3)) == pytest.approx(1.1e-4, rel=0.3)
-    assert error(world_map, lost(request_, 0.4, 1e-3, sigma=0.3)) < 1e-3
-    assert error(world_map, lost(request_, 0.05, 1e3)) == pytest.approx(0.1, rel=0.01)  # odometry went wrong
-    assert error(world_map, lost(request_, 0.45, 1.0, sigma=0.01)) == pytest.approx(0.1, rel=0.01)  # far off its drift
+    assert weighed(world_map, request_).error == 0.1
+    assert weighed(world_map, lost(request_, 0.05, 1e-3)).error == pytest.approx(1.1e-4, rel=0.3)
+    assert weighed(world_map, lost(request_, 0.4, 1e-3, sigma=0.3)).error < 1e-3
+    assert weighed(world_map, lost(request_, 0.05, 1e3)).error == pytest.approx(0.1, rel=0.01)  # odometry went wrong
+    assert weighed(world_map, lost(request_, 0.45, 1.0, sigma=0.01)).error == pytest.approx(0.1, rel=0.01)  # far off
+
+
+@pytest.mark.parametrize(("turn", "up"), [(180.0, 0.0), (90.0, 0.0), (0.0, 6.0)])
+def test_path_confirms_no_other_heading_or_storey_but_the_place_at_its_end(world_map, request_, turn, up):
+    body = T_MAP_ODOM @ request_.T_odom_body
+    end = pose_from(body[:3, :3] @ rot_z(np.radians(turn)), body[:3, 3] + [0.0, 0.0, up])
+    at_end = place(0.4, end @ inverse(request_.T_odom_body))
+    request = lost(request_, 0.0, 1e-3)
+    request = replace(request, lost=LostPlace(at_end.T_map_odom, request.lost.covariance, 1e-3))
+    out = weighed(world_map, request, [at_end])
+    assert out.error > 0.99
+    assert out.second.T_map_odom is at_end.T_map_odom
 
 
 def test_path_that_leads_beside_it_contradicts_it_unless_odometry_went_wrong(world_map, request_):
