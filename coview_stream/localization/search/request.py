@@ -32,7 +32,7 @@ class LostPlace(NamedTuple):
 
     T_map_odom: Pose  # (4, 4)
     covariance: Floats  # (6, 6) of the body's pose over (rx, ry, rz, x, y, z), map axes
-    odds: float  # that the robot is not there: the place was wrong, odometry has slipped, the robot was carried
+    odds: float  # that odometry does not lead there: the place was wrong, it has slipped, the robot was carried
 
 
 def _no_points() -> Points:

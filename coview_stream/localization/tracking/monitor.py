@@ -166,6 +166,7 @@ class LossMonitor:
     def begin(self, error: float) -> None:
         """Start at a place that is wrong with probability ``error``."""
         self._odds = self._before = error / (1.0 - error)  # now, and before the current view
+        self._verified: tuple[float, float, float] | None = None  # odds, stamp and metres driven at the last verified
         self._viewed_at = -math.inf  # metres driven at the start of the view
         self._newest: tuple[float, float] | None = None  # stamp and metres driven, of the newest registration
         self._since: float | None = None  # stamp of the first doubted registration
@@ -173,9 +174,14 @@ class LossMonitor:
         self._required = False  # whether a registration has to be believed before the next pose
 
     def odds(self, stamp: float, travelled: float) -> float:
-        """Return the odds that the robot is not where odometry continues from the newest registration."""
-        waited, driven = (0.0, 0.0) if self._newest is None else (stamp - self._newest[0], travelled - self._newest[1])
-        return self._odds + PER_METRE * max(driven, 0.0) + _PER_SECOND * max(waited, 0.0)
+        """Return the odds that the robot is not where odometry leads from the last verified pose.
+
+        Evidence of later scans does not count, as buildings that have moved speak against the right place, too.
+        """
+        if self._verified is None:
+            return self._odds
+        odds, then, driven = self._verified
+        return max(odds, PER_METRE) + PER_METRE * max(travelled - driven, 0.0) + _PER_SECOND * max(stamp - then, 0.0)
 
     def require_verification(self) -> None:
         """Start a doubt, as the robot may have been carried unseen."""
@@ -204,6 +210,7 @@ class LossMonitor:
         certain = wrong < self._rule.risk
         if verdict.verified and certain:
             self._before, self._since, self._required = self._odds, None, False
+            self._verified = self._odds, stamp, travelled
             return Ruling(Event.MATCH_VERIFIED, verdict.reason, wrong, True)
         in_doubt = self._required or self._since is not None
         if certain and not in_doubt and verdict.cause not in _AT_ONCE and verdict.ratio <= 0.0:

@@ -64,10 +64,11 @@ def test_newest_registration_of_a_view_counts(monitor):
     assert monitor.verify(verdict_of(-6.0), 1.0, 2.0).wrong > 50 * first
 
 
-def test_place_that_is_not_seen_is_doubted_by_metres_and_seconds(monitor):
-    wrong = drive(monitor, [8.0])[0].wrong
-    assert monitor.odds(0.0, 0.0) == pytest.approx(wrong, rel=1e-3)
-    assert monitor.odds(100.0, 500.0) == pytest.approx(wrong + 100.0 * 1e-4 + 500.0 * 1e-5, rel=1e-3)
+def test_path_of_odometry_is_doubted_by_metres_and_seconds_since_the_last_verified_pose(monitor):
+    drive(monitor, [8.0, -30.0, -30.0])  # what speaks against the place is left to the search
+    assert monitor.odds(0.0, 0.0) == pytest.approx(1e-5, rel=0.1)
+    assert monitor.odds(100.0, 500.0) == pytest.approx(1e-5 + 100.0 * 1e-4 + 500.0 * 1e-5, rel=1e-3)
+    assert LossMonitor(RULE, TrackingConfig()).odds(9.0, 9.0) == 0.0  # nothing was verified yet
 
 
 @pytest.mark.parametrize("metres", [0.2, 1.5, 20.0])
