@@ -68,12 +68,12 @@ def run(args: argparse.Namespace) -> int:
 
 
 def _conclusion(findings: list[Finding]) -> str:
-    """Return the last line: all is well, or how many problems and warnings there are, and the page about them."""
+    """Return the last line: no problem, or how many problems and warnings there are, and the page about them."""
     problems, warnings = (sum(finding.verdict == verdict for finding in findings) for verdict in ("FAIL", "warn"))
     if not problems + warnings:
-        return "all is well"
-    count = f"{counted(problems, 'problem')}, {counted(warnings, 'warning')}"
-    return f"{count}; by symptom, with what to do: `coview-stream help reasons`"
+        return "no problem found (a delay or a wrong mount shows only in turns)"
+    counts = [counted(count, kind) for count, kind in ((problems, "problem"), (warnings, "warning")) if count]
+    return f"{', '.join(counts)}; symptoms and remedies: `coview-stream help reasons`"
 
 
 def _robot_keys(args: argparse.Namespace) -> list[RobotKeys]:
