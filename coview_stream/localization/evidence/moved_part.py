@@ -26,7 +26,6 @@ _PRIOR = 5e-4  # probability that a survey has a part of the site shifted as a w
 _LEAST = 2.0  # metres, least shift that unexplained structure shows
 FARTHEST_MOVED = 8.0
 """Metres, greatest shift of a moved part."""
-_BUILDING = 100.0  # metres, length of a large building, a part that moves as a whole
 _SAME = 2.5  # metres: nearer shifts explain the same points
 _PATCH = 3.0  # metres
 _TAKEN = 1.0  # metres from a point of the scan within which map structure is explained
@@ -64,26 +63,29 @@ def find_moved_part(field: kernels.FieldMap, scans: Sequence[ObservedScan], T_ma
 
 
 def log_odds_of_moved(
-    field: kernels.FieldMap, scans: Sequence[ObservedScan], T_map_odom: Floats, T_map_other: Floats, metres: float
+    field: kernels.FieldMap, scans: Sequence[ObservedScan], T_map_odom: Floats, T_map_other: Floats
 ) -> float:
     """Return the log-odds of "the robot is at the other place, and structure that fits here has moved" to "it is here".
 
-    Here is ``T_map_odom``; other arguments are as in :func:`find_moved_part`. The moved share of the view is unknown:
-    that it comprises all N patches that fit here alone has probability 1 / (N + 1), and that it extends over the
-    ``metres`` driven since the scans first fitted here falls with the length of a building. No part moves farther than
-    :data:`FARTHEST_MOVED`.
+    Here is ``T_map_odom``; other arguments are as in :func:`find_moved_part`. The rest of the view has not moved, and
+    does not fit here: of the view, a share of the distribution Beta(1, 3) has moved, and if the robot is here, a share
+    of the distribution Beta(1, 1) fits. No part moves farther than :data:`FARTHEST_MOVED`.
     """
     here, other = scans[-1].poses(np.stack([T_map_odom, T_map_other]))
     shift = (other - here)[:2]
     if float(np.linalg.norm(shift)) > FARTHEST_MOVED:
         return -math.inf
-    seen, alone, ratios = SeenStructure.of(field, scans, T_map_odom).turned(float(other[3] - here[3])), 0.0, None
+    seen, alone, rest, ratios = SeenStructure.of(field, scans, T_map_odom), 0.0, 0.0, None
+    seen = seen.turned(float(other[3] - here[3]))
     if len(seen.explained):
         there = kernels.near_structure(field, seen.explained, seen.place, shift[None])[0]
         alone = float((1.0 - _in_patches(seen.explained) @ there.astype(np.float64)).sum())
+    if len(seen.unexplained) >= _MIN_POINTS:
+        rest = float(len(_in_patches(seen.unexplained)))
     if float(np.linalg.norm(shift)) >= _LEAST:
         ratios = _shift_ratios(field, seen, np.concatenate([_all_shifts(), shift[None]]))
-    return math.log(_PRIOR) - math.log1p(alone) - metres / _BUILDING + (0.0 if ratios is None else float(ratios[-1]))
+    share = 3.0 * (rest + 1.0) * (rest + 2.0) / ((alone + rest + 2.0) * (alone + rest + 3.0))
+    return math.log(_PRIOR * share) + (0.0 if ratios is None else float(ratios[-1]))
 
 
 def _all_shifts() -> Floats:

@@ -59,7 +59,7 @@ def weighed_by_odometry(
     at_end = (metres <= 0.5 * ALERT_METRES) & (radians <= math.radians(0.5 * ALERT_DEGREES))
     if at_end[0]:
         return scored  # both may be right
-    right = log_odds_of_moved(base_map.field, scans, at[0], lost.T_map_odom, scorer.extent)
+    right = log_odds_of_moved(base_map.field, scans, at[0], lost.T_map_odom)
     apart = distance[0] > chi2_quantile(len(_LEVEL), config.acceptance.risk)  # else both are modes of one place
     if apart and not (at_end & ~first).any():  # it is not weighed yet
         here, beside = scorer.beside(np.stack([at[0], lost.T_map_odom]))

@@ -124,11 +124,6 @@ class PlaceScorer:
         return self._scans[-_NEWEST:]
 
     @property
-    def extent(self) -> float:
-        """Metres between the first and the newest keyframe."""
-        return float(np.linalg.norm(self._scans[-1].body - self._scans[0].body)) if self._scans else 0.0
-
-    @property
     def followed(self) -> Followed:
         """Followed places, the most probable first."""
         return self._followed

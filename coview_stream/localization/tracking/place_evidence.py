@@ -71,11 +71,9 @@ class PlaceEvidence:
         observed = scan.few.look_up(self._base_map.field, poses, Move.NEAR)
         return observed.poses, self._ratios(log_likelihoods(observed.shares, self._background(scan, T_map_odom)))
 
-    def log_odds_of_moved(
-        self, scans: Sequence[ObservedScan], T_map_odom: Pose, T_map_other: Pose, metres: float
-    ) -> float:
+    def log_odds_of_moved(self, scans: Sequence[ObservedScan], T_map_odom: Pose, T_map_other: Pose) -> float:
         """Return the log-odds that the robot is at the other pose, and the structure that fits here has moved."""
-        return log_odds_of_moved(self._base_map.field, scans, T_map_odom, T_map_other, metres)
+        return log_odds_of_moved(self._base_map.field, scans, T_map_odom, T_map_other)
 
     def learn(self, observation: Observation) -> None:
         """Learn the nuisance parameters from a believed registration; others would make a wrong place usual."""

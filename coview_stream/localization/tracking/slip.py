@@ -55,7 +55,6 @@ class Dispute:
         self._before = np.zeros(0)  # log-likelihood ratios of the earlier views
         self._newest = np.zeros(0)  # and of the current one
         self._begun = -math.inf  # metres driven at the start of the view
-        self._since = math.inf  # metres driven at the first view
         self._scans: list[ObservedScan] = []  # the newest of each view
 
     def settle(
@@ -69,7 +68,7 @@ class Dispute:
         clouds alone, that odometry has slipped.
         """
         if travelled - self._begun >= self._view:
-            self._begun, self._since = travelled, min(self._since, travelled)
+            self._begun = travelled
             self._before = self._before + self._newest
             self._scans = [*self._scans, scan][-_VIEWS:]
         self._scans[-1] = scan
@@ -89,9 +88,7 @@ class Dispute:
             return best != 0 and float(total[best] - np.logaddexp.reduce(total[apart])) >= -math.log(risk)
 
         if leads():  # or odometry is right, and what fits here has moved
-            moved = self._place.log_odds_of_moved(
-                self._scans, self._poses[best], self._poses[0], travelled - self._since
-            )
+            moved = self._place.log_odds_of_moved(self._scans, self._poses[best], self._poses[0])
             total[0] = np.logaddexp(total[0], total[best] + moved - math.log(slipped))
         return here[best] if leads() else None
 

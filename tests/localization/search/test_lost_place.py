@@ -31,8 +31,6 @@ def request_(world_drive):
 class Silent:
     """A scorer by which all poses explain the keyframes equally."""
 
-    extent = 0.0
-
     def beside(self, poses):
         return np.zeros(len(poses))
 
