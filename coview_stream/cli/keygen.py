@@ -19,5 +19,5 @@ def run(args: argparse.Namespace) -> int:
 
     private, public, fingerprint = make_keys(args.name)
     print(f"{private}: signs maps (build --sign); keep it where maps are built, readable by you only")
-    print(f"{public}: verifies them (--verify-key of serve, locate and info); fingerprint {fingerprint}")
+    print(f"{public}: verifies them (--verify-key of serve, locate, info and fuse); fingerprint {fingerprint}")
     return 0

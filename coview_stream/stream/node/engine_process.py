@@ -10,6 +10,7 @@ import contextlib
 import gc
 import logging
 import os
+import pickle
 import socket
 import subprocess
 import sys
@@ -222,7 +223,7 @@ class EngineProcess:
             self._end()
             raise DiedError(str(error)) from error
         with self._exchange(self.job_timeout) as pipe:
-            pipe.send(job)
+            pipe.send_bytes(pickle.dumps(job))  # send() fails with a view of a BytesIO, on which Python 3.12.1 crashes
             while (answer := pipe.recv()) == _DOUBT:
                 self.on_doubt()
         kind, value = answer
