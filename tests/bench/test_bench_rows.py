@@ -3,6 +3,7 @@
 import json
 import math
 import re
+import shutil
 import sys
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
@@ -111,6 +112,8 @@ def test_only_tables_that_were_run_change_the_page():
 @pytest.fixture
 def two_tables(monkeypatch, tmp_path):
     """A release of two tables, whose code and measured texts the test sets."""
+    if shutil.which("git") is None:
+        pytest.skip("no git, which names the commit of a table")
     said = SimpleNamespace(
         code="1", bench={"a": "3", "b": "4"}, ran=[], texts={"a": "of a", "b": "of b"}, page=tmp_path / "page.md"
     )
