@@ -223,7 +223,7 @@ class EngineProcess:
             self._end()
             raise DiedError(str(error)) from error
         with self._exchange(self.job_timeout) as pipe:
-            pipe.send_bytes(pickle.dumps(job))  # send() fails with a view of a BytesIO, on which Python 3.12.1 crashes
+            pipe.send_bytes(pickle.dumps(job))  # a failed send() keeps a view of a BytesIO: python/cpython#111049
             while (answer := pipe.recv()) == _DOUBT:
                 self.on_doubt()
         kind, value = answer
