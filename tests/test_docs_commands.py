@@ -21,7 +21,10 @@ DOCS = Path(__file__).resolve().parents[1] / "docs"
 LASTING = {"serve", "serve-map", "watch"}
 """Commands that go on until they are told to end."""
 
-NEEDS = {"kiss-icp": "kiss_icp", "--foxglove": "foxglove", "--record": "foxglove", "--sign": "cryptography"}
+NEEDS = {
+    "kiss-icp": "kiss_icp", "--foxglove": "foxglove", "--record": "foxglove", "drive.rrd": "rerun", "--ros2": "rclpy",
+    "--sign": "cryptography",
+}  # fmt: skip
 """Modules without which commands with a word are left out."""
 
 NOT_RUN = {"demo": "has tests of its own", "train": "takes an hour", "https://.../area.copc.laz": "the network"}
