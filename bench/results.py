@@ -7,13 +7,13 @@ benchmark with the modules that it imports. Quick runs have tables of their own.
 ``python -m bench release --work DIR [--only NAME...] [--quick]`` makes a page of one product, for a release. The page
 is its memory: a table that is there, of both hashes and by the same command, is done, and one that is made goes into it
 at once. So a release continues in another DIR or on another machine while the product's hash is the same (comments,
-docstrings and layout do not count; it is one minor version of Python's), and a mended benchmark repeats only its own
-tables. Remove the file of the kept runs of ``integrity`` when the product has changed. The most valuable tables come
-first. Those without times run side by side, one on each core, the others alone; most keep the results of each drive or
-site in ``DIR/worlds`` as well, so that an interruption costs minutes (``soak``, an hour in one piece, starts again). It
-says which tables are missing, and about how long they take. What a table leaves out to be done in time stands behind
-``thinned``. Once all are there, older tables are removed; those that no command makes are kept below the others. A
-quick release has its page in DIR.
+docstrings and layout do not count, nor the picture of a map; it is one minor version of Python's), and a mended
+benchmark repeats only its own tables. Remove the file of the kept runs of ``integrity`` when the product has changed.
+The most valuable tables come first. Those without times run side by side, one on each core, the others alone; most keep
+the results of each drive or site in ``DIR/worlds`` as well, so that an interruption costs minutes (``soak``, an hour in
+one piece, starts again). It says which tables are missing, and about how long they take. What a table leaves out to be
+done in time stands behind ``thinned``. Once all are there, older tables are removed; those that no command makes are
+kept below the others. A quick release has its page in DIR.
 """
 
 from __future__ import annotations
@@ -44,6 +44,7 @@ from coview_stream.clouds.atomic_file import atomic_path
 from coview_stream.errors import InputError
 
 PAGE = ROOT / "docs" / "results.md"
+_PICTURE = Path("coview_stream/report/relief.py")  # of a map; no benchmark draws it
 
 
 class Table(NamedTuple):
@@ -369,8 +370,9 @@ def introduction(page: str) -> str:
 
 
 def _code() -> str:
-    """Short hash of the product and the kernels."""
-    return fingerprint()
+    """Short hash of the product and the kernels, but for :data:`_PICTURE`."""
+    product = (file.relative_to(ROOT) for file in sorted((ROOT / _PICTURE.parts[0]).rglob("*")) if file.is_file())
+    return fingerprint(*(str(file) for file in product if file != _PICTURE), "coview_kernels")
 
 
 def _made_by(name: str) -> str:

@@ -129,7 +129,9 @@ def two_tables(monkeypatch, tmp_path):
         monkeypatch.setitem(results.BENCHMARKS, name, Benchmark(module, ""))
 
     def fingerprint(*parts):
-        return said.bench["a" if "bench/speed/search.py" in parts else "b"] if parts else said.code
+        if "coview_kernels" in parts:
+            return said.code
+        return said.bench["a" if "bench/speed/search.py" in parts else "b"]
 
     monkeypatch.setattr(results, "fingerprint", fingerprint)
     monkeypatch.setattr(results, "measured", measured)
