@@ -69,7 +69,7 @@ def relief(base_map: BaseMap) -> Relief:
     smooth = _around(tall & (bump < _SMOOTH * cell)) >= 0.5 * beside
     core = tall & smooth & (plane >= _PLANE * np.maximum(count, 1.0))
     roof = tall & (_around(_around(core)) >= 0.4 * _around(beside))  # includes edges and chimneys
-    colour = np.empty((*shape, 3))
+    colour = np.zeros((*shape, 3))
     for name, where in {"ground": known, "trees": tall & ~roof, "roofs and walls": roof}.items():
         colour[where] = _COLOURS[name]
     rgba = np.zeros((*shape, 4), dtype=np.uint8)

@@ -38,7 +38,8 @@ def hue_at(seen, at):
 
 
 @pytest.mark.slow
-def test_roofs_trees_and_ground_are_told_apart_on_a_slope(site):
+def test_roofs_trees_and_ground_are_told_apart_on_a_slope(site, monkeypatch):
+    monkeypatch.setattr(np, "empty", lambda *shape, **kind: np.full(*shape, np.nan, **kind))  # as memory may be
     seen = relief(site)
     assert {colour: hue_at(seen, at) for colour, at in CENTRES.items()} == {colour: colour for colour in CENTRES}
 
