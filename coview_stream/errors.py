@@ -47,7 +47,7 @@ class CloudError(InputError):
 
 
 class RunError(InputError):
-    """A run's frames, odometry or stamps do not match."""
+    """A recorded run cannot be read, or its frames, odometry and stamps do not match."""
 
 
 class MapError(InputError):
@@ -63,7 +63,7 @@ class EncodingError(MessageError):
 
 
 class TransportError(CoViewError):
-    """A network session cannot be opened, or its configuration is wrong."""
+    """A network connection cannot be opened or has failed, or its configuration is wrong."""
 
 
 class DependencyError(CoViewError, ImportError):
@@ -147,7 +147,7 @@ def require_installed(module: str, purpose: str) -> None:
 
 @contextmanager
 def naming_missing_libraries(purpose: str, extra: str | None = None) -> Iterator[None]:
-    """Turn the ImportError of a module into a :class:`DependencyError` that names an extra.
+    """Turn the ModuleNotFoundError of a missing library into a :class:`DependencyError` that names its extra.
 
     ``purpose`` is for the message; ``extra`` installs all modules needed, by default the one with this module.
     """

@@ -52,7 +52,7 @@ _TYPES = {
     "U8": "|u1",
 }  # fmt: skip
 _NAMES = {kind: name for name, kind in _TYPES.items()}
-_TIERS = ("", ".rest")
+_TIERS = ("", ".rest")  # suffixes of the two tiers of station codes
 _Shape = tuple[str | int, ...]
 _EXPECTED: dict[str, tuple[str, _Shape]] = {
     "origin": ("<f8", (3,)),
@@ -137,7 +137,7 @@ def check_target(path: Path) -> None:
     """Refuse to replace anything but a map.
 
     Raises:
-        MapError: the path is a directory, a device or another kind of file, or its directory does not exist.
+        MapError: the path is a directory, a device or a file that is no map, or its directory does not exist.
     """
     if path.is_dir() or not path.resolve().parent.is_dir():
         raise MapError(f"{path}: not a place for a file; give a name in a directory that exists")
@@ -372,7 +372,7 @@ def check_arrays(arrays: Mapping[str, npt.NDArray[Any]], config: MapConfig, poin
             )
             if not ((first >= low - _BESIDE) & (last <= high + _BESIDE)).all():  # false for NaN as well
                 raise _refused(name, "lies beside the surveyed cells")
-    # each stretch of points once, so that no crop is larger than the map
+    # tiles must not share points: no crop may be larger than the map
     stretches = arrays["tile_index"][:, 2:]
     begin, end = stretches[np.lexsort(stretches.T)].T if len(stretches) else stretches.T
     if len(arrays["points"]) > MAX_POINTS:

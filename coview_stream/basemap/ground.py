@@ -40,8 +40,8 @@ _TILE, _MARGIN = 256.0, 24.0  # metres: smaller cloths rest sooner and fit the c
 _MIN_POINTS = 10  # for a cloth to rest on
 # morphological filter
 _MAX_WINDOW = 40.0  # metres: wider roofs pass for ground, larger hills survive whole
-_MAX_SLOPE = 0.3  # of terrain between two windows
-_FIRST_THRESHOLD = 0.5  # metres above the surface opened by the first window
+_MAX_SLOPE = 0.3  # rise per metre of terrain that a wider window must not remove
+_FIRST_THRESHOLD = 0.5  # metres above the opened surface that every window leaves
 
 
 def cloth_available() -> bool:
@@ -190,7 +190,7 @@ def ground_mask(points: Points, method: Method = "auto") -> Bools:
     """
     if not len(points):
         return np.zeros(0, dtype=bool)
-    from scipy import ndimage  # not part of the robot's side
+    from scipy import ndimage  # only for builds: an installation without extras lacks it
 
     surface = _ground_surface(points, method)
     slope = _gradient(ndimage.gaussian_filter(surface.z, 1.0 / surface.cell, mode="nearest"), surface.cell)
@@ -232,8 +232,8 @@ def _ground_surface(points: Points, method: Method) -> GroundRaster:
 
 
 def _stray_low(z: Floats32) -> Bools:
-    """Mask cells more than 1 m below all but three of their 9 x 9 neighbours: echoes from below the ground."""
-    from scipy import ndimage  # not part of the robot's side
+    """Mask cells more than 1 m below the fourth lowest of the 9 x 9 cells around: echoes from below the ground."""
+    from scipy import ndimage  # only for builds: an installation without extras lacks it
 
     high = np.where(np.isnan(z), np.float32(np.inf), z)
     fourth = ndimage.rank_filter(high, rank=3, size=9, mode="nearest")
@@ -242,7 +242,7 @@ def _stray_low(z: Floats32) -> Bools:
 
 def _refined(shape: tuple[int, int], heights: Floats32, occupied: Ints, ground: Bools, cell: float) -> Floats32:
     """Raster the ground cells, and add lowest points near the interpolated raster, which restores steep slopes."""
-    from scipy import ndimage  # not part of the robot's side
+    from scipy import ndimage  # only for builds: an installation without extras lacks it
 
     for _ in range(_REFINEMENTS + 1):
         raster = np.full(shape, np.nan, dtype=np.float32)
@@ -273,7 +273,7 @@ def _morphological_ground(z: Floats32, cell: float) -> Bools:
     Openings with growing windows remove objects that are narrower than the window and rise above the opened surface
     by more than a slope of 0.3 explains.
     """
-    from scipy import ndimage  # not part of the robot's side
+    from scipy import ndimage  # only for builds: an installation without extras lacks it
 
     surface = filled(z)
     ground = np.isfinite(z)

@@ -1,6 +1,6 @@
 """Several maps placed side by side in one frame, so that one search compares places on all of them.
 
-Places on other maps are rivals like places on the same map, and a robot that fits two storeys alike gets no pose. The
+A place on another map competes like one on the same map: a robot whose scans fit two storeys equally gets no pose. The
 gap between two maps is wider than any scan.
 """
 
@@ -32,7 +32,7 @@ from coview_stream.geometry.arrays import Floats, Ints
 JOINED_SUFFIX = ".joined"
 
 _NAMES_FORMAT = "coview-joined"
-_VERSION = 2  # of the arrays that are built from the same maps
+_VERSION = 2  # in the file's name; counts changes of the arrays that are built from the same maps
 
 _MIN_GAP = 300.0  # metres: a lidar's range, and a margin beyond the map's edge
 _SHARED = ("block", "voxel", "tile", "descriptor")

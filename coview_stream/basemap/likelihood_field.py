@@ -35,7 +35,7 @@ _GROUND_GROWTH = 2  # cells by which the ground is extended into cells without p
 _DROP = 2.0  # metres: smaller drops are no walls
 _REACH = 5  # cells, odd: at an edge the lowest top in this window is lower by more than the drop
 _OVERHANG = 3  # cells, odd: a wall stands in this window around the edge
-_NOTHING = np.float32(-1e6)
+_NOTHING = np.float32(-1e6)  # metres: height of an empty cell
 FIELD_ARRAYS = ("field.tiles", "field.occupied", "field.ground", "field.edge")
 LAYERS = "field.layers."
 """Names of a field's arrays in a map file, and prefix of the names of its layers."""
@@ -88,7 +88,7 @@ def field_arrays(points: Points, normals: Points, surveyed: Bools, corner: Float
 def layers_arrays(arrays: Arrays, zeros: Zeros | None = None, done: Callable[[], object] = lambda: None) -> Arrays:
     """Return the layers of a map's field, for a working file.
 
-    ``zeros`` allocates the arrays, by default in memory; ``done`` is called after each batch.
+    ``zeros`` allocates the arrays, by default in memory. With ``zeros``, ``done`` is called after each batch.
     """
     field = field_of(arrays)
     layers = field.layers if zeros is None else field.made_layers(zeros, done)

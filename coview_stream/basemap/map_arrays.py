@@ -45,7 +45,7 @@ class Tiles(Protocol):
         """Return column and row (K, 2) of the blocks that hold points; with ``beside`` also blocks of tiles around."""
 
     def described(self, wanted: Ints, keys: Collection[Key] | None = None) -> Iterator[tuple[Described, Ints]]:
-        """Yield descriptors of the stations ``wanted`` that lie on all tiles or on ``keys``, with their map numbers."""
+        """Yield descriptors and map numbers of the stations ``wanted`` (K,) that are on ``keys`` (None: any tile)."""
 
     def field(self, key: Key, surveyed: Bools, corner: Floats) -> Arrays:
         """Return the likelihood field of a tile; no arrays where nothing is surveyed."""
@@ -73,7 +73,7 @@ class MemoryArrays:
         return {name: parts[0] if len(parts) == 1 else np.concatenate(parts) for name, parts in self._parts.items()}
 
     def release(self) -> None:
-        """Release the memory of arrays that are in files."""
+        """Release the memory of arrays that a subclass keeps in files; arrays in memory stay."""
 
 
 class MemoryTile:

@@ -13,8 +13,8 @@ from coview_stream.geometry.arrays import Floats
 from coview_stream.geometry.transforms import Pose
 
 _MAX_PARTS = 1000
-_MAX_NAME = 64
-_MAX_METRES = 1e8
+_MAX_NAME = 64  # letters
+_MAX_METRES = 1e8  # metres: no place on this planet
 
 
 @dataclass(frozen=True)
@@ -25,7 +25,7 @@ class MapPart:
         name: name of the map.
         sha256: hash of the map.
         crs: reference system of its own frame, None if unknown.
-        shift: (3,) metres, from its own frame to the joined frame.
+        shift: (3,) metres; a position in the joined frame is the one in its own frame plus this.
         begin, end: its range of x in the joined frame, metres, including half of the gaps to its neighbours.
     """
 

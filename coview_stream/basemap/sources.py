@@ -28,7 +28,7 @@ from coview_stream.geometry.arrays import Reals
 from coview_stream.geometry.validation import to_array
 
 Given = str | os.PathLike[str] | npt.NDArray[Any]
-"""A source from a caller: a file, or (N, 3) points."""
+"""A source from a caller: a file, a folder, a pattern, or an array (N, 3 or more)."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -37,9 +37,9 @@ class Source:
 
     Attributes:
         path: the file, or an array's name for messages.
-        rows: (N, 3) float32 or float64 coordinates of an array, metres; None for a file.
+        rows: (N, 3) float32 or float64 coordinates of an array, in ``unit``; None for a file.
         crs: reference system, in metres, of an array or of a file that states none.
-        unit: unit of such coordinates, if it is not the metre.
+        unit: unit of the coordinates that ``crs`` is for; None is the metre.
     """
 
     path: Path
@@ -101,7 +101,7 @@ def sources_of(given: Given | Sequence[Given], crs: str | None = None) -> list[S
     """Return the sources for files, folders, patterns and arrays (N, 3 or more); ``crs`` is for those without one.
 
     Raises:
-        MapError: there is no source, or a file is named twice. CloudError: an array is no cloud.
+        MapError: there is no source, or a file is named twice. CloudError: an array, folder or pattern has no cloud.
         ConfigError: ``crs`` is no text, or no system in metres.
     """
     if not isinstance(crs, str | None):

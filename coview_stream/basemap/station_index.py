@@ -23,14 +23,14 @@ from coview_stream.geometry.arrays import Complexes, Floats32, Ints
 Descriptors = Mapping[Channel, npt.NDArray[Any]]
 """(M, R, S) of each channel."""
 
-_SAMPLE = 128  # stations whose scores at all shifts give median and spread
+_SAMPLE = 128  # at most so many stations, whose scores at all shifts give median and spread
 CODES = ("station_codes", "station_codes.rest")  # names of the tiers' codes in a map's file
 _SAMPLED = "station_codes.sample"
 
 
 @dataclass(frozen=True)
 class ScoredQuery:
-    """A query of :class:`StationIndex`.
+    """Query prepared by :meth:`StationIndex.query`.
 
     Attributes:
         coded, rest: codes in each tier, channels weighted by the inverse of their spread; no ``rest`` without a second
@@ -101,7 +101,7 @@ class StationIndex:
     def subset(self, stations: Ints, second: bool = True) -> StationIndex:
         """Return the index of stations (K,), copied into memory, with or without the second tier.
 
-        The sample of the whole index standardises its queries.
+        Medians and deviations of its queries are those of the whole index.
         """
         rest = self.tiers[1].subset(stations) if second else None
         index = StationIndex(self.codes.subset(stations), rest, self._descriptors)

@@ -85,7 +85,7 @@ def _flat_and_wide(column: Ints, floor: Ints, ceiling: Ints, shape: tuple[int, i
 
 
 def _one_slab(column: Ints, floor: Ints, ceiling: Ints, shape: tuple[int, int]) -> Bools:
-    from scipy import ndimage  # not part of the robot's side
+    from scipy import ndimage  # only for builds: an installation without extras lacks it
 
     row, col = np.divmod(column, shape[1])
     # crop to this slab's candidates; one cell of border keeps neighbours inside
@@ -110,7 +110,7 @@ def _one_slab(column: Ints, floor: Ints, ceiling: Ints, shape: tuple[int, int]) 
 
 def _upper_squares(floors: Points, base: Points, cell: float) -> Points:
     """Find the squares of floors above the base level of their cell that cover a quarter of the cell."""
-    from scipy import ndimage  # not part of the robot's side
+    from scipy import ndimage  # only for builds: an installation without extras lacks it
 
     if not len(floors):
         return floors.reshape(0, 3)
@@ -221,7 +221,8 @@ def describe_stations(
 ) -> Described:
     """Describe the virtual reference scans at ``stations`` (M, 3) by channels (M, R, S), float16.
 
-    float16 resolves 2 cm at 30 m height, far below the noise of a maximum over a bin.
+    float16 resolves 2 cm at 30 m height, far below the noise of a maximum over a bin. MapError if a station is beside
+    the raster.
     """
     shape = (len(stations), config.rings, config.sectors)
     described: Described = {name: np.empty(shape, dtype=np.float16) for name in config.channels}
@@ -280,7 +281,8 @@ class HeightRaster:
 def aligned_corner(points: Points, block: float, cell: float) -> Floats:
     """Return the lower left corner (2,) of a raster with a cell centred on the centre of every ``block``-sized cell.
 
-    Stations stand at ``(k + 1/2) * block``, a multiple of ``cell``; the shift lets one offset table serve all of them.
+    Stations stand at ``(k + 1/2) * block``, and ``block`` is a multiple of ``cell``: every station is at a cell's
+    centre, so that one table of offsets to bins serves all.
     """
     lowest = np.floor(points[:, :2].min(axis=0).astype(np.float64) / block) * block
     return np.asarray(lowest + 0.5 * block - cell * (np.ceil(0.5 * block / cell) + 0.5))
@@ -325,7 +327,7 @@ class StationGrid:
 
     Attributes:
         stations: (M, 3) float32 metres, in the map's frame.
-        block: metres, edge of a cell.
+        block: metres, edge of a cell; MapError if one has more than 128 stations.
     """
 
     def __init__(self, stations: Floats32, block: float) -> None:
@@ -356,7 +358,7 @@ class StationGrid:
         return len(self.stations)
 
     def at(self, positions: Reals) -> Indices:
-        """Return the station (N,) at each of (N, 3) positions, -1 for none; of several levels the nearest in 2.5 m."""
+        """Return the station (N,) in each position's cell, (N, 3), or -1; of several levels the nearest in 2.5 m."""
         cell = self.cell(positions)
         if self._single is not None:
             return np.asarray(self._single.take(cell), dtype=np.intp)

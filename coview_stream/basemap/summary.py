@@ -30,7 +30,7 @@ _THIN = 8.0  # points per m2 of a survey: with more, real runs were found as ear
 _LOW = 1.0  # metres: least height of a standing object
 _BARE = 0.02  # least share of the squares with a standing object
 _FLAT_SHARE = 2.0  # an axis is taken for the vertical if this many times more surfaces face along it than along z
-_FACING = np.cos(np.radians(20.0))
+_FACING = np.cos(np.radians(20.0))  # least part of a unit normal along an axis that its surface faces
 _HOLES = 0.15  # least surveyed share of a station's surroundings, for half of the stations
 
 _DRAWN_POINTS = 2_000_000
@@ -46,7 +46,7 @@ _GROWTH = 1.2  # factor by which cells grow until few enough points are left
 _GROUND_BAND = 0.4  # metres above the ground height that are still ground
 _GROUND_CELL = 4.0  # metres: in a survey without a map, the lowest point of such a cell is ground
 _MAX_CRS = 8000  # letters
-_FINEST = 0.005  # metres: a step on the wire
+_FINEST = 0.005  # metres: least step of coordinates on the wire
 _MAX_COORDINATE = 1e8  # metres: no place on this planet
 
 
@@ -103,7 +103,7 @@ class SummarizedMap(Protocol):
     arrays: dict[str, Any]
 
     def sampled_points(self, count: int) -> Points:
-        """Return some of the points."""
+        """Return at most ``count`` of the points."""
 
 
 def summary(base_map: SummarizedMap) -> MapSummary:
@@ -276,7 +276,10 @@ class MapView:
         return self.points.min(axis=0).astype(np.float64), self.points.max(axis=0).astype(np.float64)
 
     def to_json(self) -> dict[str, Any]:
-        """Plain data: points as base64 of little-endian int16 in ``step_m``, the ``ground`` ground points first."""
+        """Return plain data: ``points`` is base64 of (N, 3) little-endian int16, ``step_m`` each, from ``origin``.
+
+        The first ``ground`` points are on the ground.
+        """
         order = np.argsort(~self.is_ground, kind="stable")
         low, high = self.bounds
         middle = np.round(0.5 * (low + high))

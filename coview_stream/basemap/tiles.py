@@ -17,7 +17,7 @@ Key = tuple[int, int]
 """Column and row of a tile."""
 
 _NORMAL_SCALE = 127.0
-_SHORTEST = 0.0625  # length of a kept normal: as int8, a shorter one would be off by more than 7 degrees
+_SHORTEST = 0.0625  # least stored length: as int8, a shorter normal could be off by more than 6 degrees
 
 
 def scaled_normals(normals: Points, planarity: Floats32) -> Points:
@@ -38,7 +38,7 @@ def sort_by_tile(points: Points, normals: Points | Int8s, tile: float) -> tuple[
 
 
 def spans(index: Ints, tile: float, centre: Floats, radius: float) -> Ints:
-    """Return begin and end (S, 2) of the tiles within ``radius`` metres of ``centre``."""
+    """Return begin and end (S, 2) of the points on each tile that meets the square ``centre`` +- ``radius`` metres."""
     low = np.floor((centre[:2] - radius) / tile)
     high = np.floor((centre[:2] + radius) / tile)
     return np.asarray(index[((index[:, :2] >= low) & (index[:, :2] <= high)).all(axis=1), 2:])

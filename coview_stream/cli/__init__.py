@@ -3,8 +3,8 @@
 A command module has ``HELP: str``, ``add_arguments(parser)`` and ``run(args) -> int``. Heavy libraries are imported
 inside ``run``, because ``coview-stream --help`` must answer at once.
 
-Exit codes: 0 done; 1 could not localize (files are still written), no subscriber (replay), a check failed (doctor);
-2 bad usage or input; 130 interrupted; 141 the reader of a pipe went away.
+Exit codes: 0 done; 1 could not localize (files are still written), no subscriber (replay), a check failed (doctor),
+something was left out (build); 2 bad usage or input; 130 interrupted; 141 the reader of a pipe went away.
 """
 
 from __future__ import annotations

@@ -35,7 +35,7 @@ HELP = "simulate a site and a robot, build the map, localize, compare with the t
 
 _PICTURES = ("map.png", "trajectory.png", "errors.png", "descriptors.png")
 _WRITTEN = (*_PICTURES, "trajectory.tum", "result.json", "report.json")
-_STEPS = 4
+_STEPS = 4  # of the demo, numbered on stderr
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:

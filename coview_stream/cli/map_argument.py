@@ -70,7 +70,7 @@ def local_map(
     """Return the map that a command was given, by path or address; a remote site is fetched and checked.
 
     ``around`` is ``X,Y,RADIUS``, None for all of it; ``verify_key`` must have signed a remote site. ``base``,
-    ``connect`` and ``config`` are the zenoh key, endpoints and configuration for ``zenoh://SITE``.
+    ``connect`` and ``config`` are the first part of its keys, endpoints and configuration for ``zenoh://SITE``.
 
     Raises:
         ConfigError: a malformed address or circle. TransportError: it cannot be fetched, and never was.

@@ -16,8 +16,8 @@ HELP = "feed a recorded run into zenoh as a live robot"
 
 _NO_ODOMETRY = "none"
 _LAST_WAIT = 0.5  # seconds, set by hand: a session learns of subscribers shortly after its first query
-_STARTS = 120.0  # seconds, the longest start of an engine: EngineProcess; the first start compiles kernels
-_NAMED = 5  # robots
+_STARTS = 120.0  # seconds for the engines to be ready, as EngineProcess.open_timeout; the first start compiles kernels
+_NAMED = 5  # robots named in a message
 _MAX_SPACING = 0.4  # seconds, set by hand: 0.1 s of jitter below NodeConfig.odometry_timeout
 
 

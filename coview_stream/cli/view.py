@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from coview_stream.viewers.scene import Sink
     from coview_stream.viewers.session_feed import SessionFeed, Topic
 
-_WEB = "127.0.0.1:8642"
+_WEB = "127.0.0.1:8642"  # as viewers.web_page has it; --help imports nothing
 _FOXGLOVE = "127.0.0.1:8765"
 
 

@@ -28,8 +28,8 @@ class Cloud:
 
     Attributes:
         points: (N, 3) float32 metres, ``raw - origin``, subtracted in float64.
-        origin: (3,) float64 metres. Zero if the cloud lies within ``LOCAL_LIMIT`` of its frame's zero, otherwise the
-            median of the points, rounded to 100 m.
+        origin: (3,) float64 metres. Zero if its first points lie within ``LOCAL_LIMIT`` of its frame's zero, otherwise
+            their median, rounded to 100 m.
         crs: coordinate reference system as stated in the file (WKT or ``EPSG:code``), else None.
         classification: (N,) uint8 LAS classes, if the format has them.
         dropped: number of rows left out: not finite, beyond ``MAX_COORDINATE``, withheld or labelled as noise.

@@ -45,10 +45,9 @@ class CloudHead:
 
 
 def read_head(path: str | os.PathLike[str]) -> CloudHead:
-    """Check a file as far as possible without reading its points.
+    """Return the head of a file, checked as far as possible without reading its points.
 
-    Raises:
-        CloudError: see :func:`~coview_stream.clouds.files.read_cloud`.
+    CloudError as in :func:`~coview_stream.clouds.files.read_cloud`.
     """
     path = Path(path)
     if check_format(path) != "LAS":
@@ -77,8 +76,7 @@ def _extent(cloud: Cloud) -> Floats:
 def head_of(path: Path, cloud: Cloud) -> CloudHead:
     """Return the head of a file that was read, with its extent without stray points.
 
-    Raises:
-        CloudError: the extent is too large for a map.
+    CloudError if the extent is too large for a map.
     """
     low, high = _extent(cloud)
     wide = high - low

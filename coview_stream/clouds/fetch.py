@@ -27,7 +27,7 @@ from coview_stream.errors import CloudError, ConfigError
 
 _TIMEOUT = 30.0  # seconds without a byte
 _TRIES = 4
-_WAIT = 0.5  # seconds before the second try, doubled before each further one
+_WAIT = 0.5  # seconds before the third try; half of them before the second, twice as many before the fourth
 _BLOCK = 1 << 16  # least bytes of a request: a header, its records and a hierarchy are many small reads
 _ANSWERS = (http.client.NOT_MODIFIED, http.client.REQUESTED_RANGE_NOT_SATISFIABLE)
 _BUSY = (408, 425, 429, 500, 502, 503, 504)
@@ -68,7 +68,7 @@ class Fetched:
     """Counts of a fetched file.
 
     Attributes:
-        points: number of points in the window.
+        points: number of points in the window; 0 for a whole file.
         received: bytes from a web server; 0 for a local file.
         requests: number of requests to the web server.
     """

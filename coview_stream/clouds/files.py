@@ -153,7 +153,7 @@ def stream_cloud(path: Path, builder: CloudBuilder, unit: SurveyUnit | None = No
     """Pass a file's raw points, float64 metres, to a builder; return the reference system, if the file states one.
 
     ``unit`` is for a file that states none. LAS, LAZ and E57 are read in chunks; other formats are read whole first.
-    CloudError as in :func:`read_cloud`, except for a file without points.
+    CloudError as in :func:`read_cloud`, but not for LAS, LAZ or E57 without points.
     """
     kind = check_format(path)
     builder = builder if unit is None else InMetres(builder, unit)
@@ -210,11 +210,10 @@ def sniff(head: bytes) -> str | None:
 def write_cloud(path: str | os.PathLike[str], points: Reals, origin: npt.ArrayLike | None = None) -> None:
     """Write (N, 3) points in metres, shifted by a float64 ``origin`` (3,), in the format of the suffix.
 
-    PCD and PLY are binary little-endian. PCD, PLY and NPY hold float32, or float64 if ``origin`` shifts the points
-    beyond 10 km; LAS and LAZ hold millimetres; ``.bin`` is always float32 with zero intensity.
+    PCD and PLY are binary little-endian. PCD, PLY and NPY hold float32, or float64 if shifted float64 points
+    reach beyond 10 km; LAS and LAZ hold millimetres; ``.bin`` is always float32 with zero intensity.
 
-    Raises:
-        CloudError: unknown suffix, wrong shape, coordinates too large for ``.bin``, or the file cannot be written.
+    CloudError for an unknown suffix, a wrong shape, coordinates that the format cannot hold, or a failed write.
     """
     path = Path(path)
     writer = _WRITERS.get(path.suffix.lower())

@@ -63,8 +63,8 @@ def estimate_normals(points: Points, k: int = 20, radius: float | None = None) -
 
     Planarity is 1 - 3 s, where s is the share of the covariance's smallest eigenvalue ("surface variation", Pauly et
     al., 2002): 1 on a plane, 0 for isotropic scatter as in a crown. Fewer than three neighbours give (0, 0, 1) and 0.
-
-    Points (N, 3) are float32 metres, finite; neighbours are the ``k`` nearest, within ``radius`` metres if given.
+    Points (N, 3) are float32 metres, finite; the ``k`` nearest, itself included, are a point's neighbours, within
+    ``radius`` metres if given.
     """
     if not len(points):
         return points.reshape(0, 3), np.empty(0, dtype=np.float32)

@@ -1,4 +1,4 @@
-"""PLY files: ascii and binary in either byte order; elements before the vertices of a binary file have no lists."""
+"""PLY files: ascii and binary in either byte order; before the vertices of a binary file no element may have lists."""
 
 from __future__ import annotations
 

@@ -39,7 +39,7 @@ _COMMON_ROW = 840  # values, a multiple of each number of columns, so that the s
 # tested with 3 to 8 columns on frames of three scanners (tests/clouds/test_rows.py)
 _JUDGED, _MIN_JUDGED = 100_000, 3000  # values
 _BINS = 64
-_ALIKE = 0.9  # share of the most information: the least number above it is taken, as multiples do as well
+_ALIKE = 0.9  # share of the most information; the least number of columns above it is taken, not a multiple of it
 _CLEARLY, _LEAST = 1.4, 0.02  # factor and nats by which another number has to beat the expected one
 _CHUNK = 1_000_000  # rows
 
@@ -47,8 +47,8 @@ _CHUNK = 1_000_000  # rows
 def read_text(path: Path) -> Cloud:
     """Read x, y and z (metres) from text, in the first three columns or those that a title line names.
 
-    Spaces, tabs, commas or semicolons separate the columns. Other columns, lines that begin with #, // or ;, and the
-    numbers of points in a PTS file are skipped. CloudError names a line that is no point.
+    Spaces, tabs, commas or semicolons separate the columns. Other columns, lines that begin with #, //, ; or %, and
+    the numbers of points in a PTS file are skipped. CloudError names a line that is no point.
     """
     builder = CloudBuilder()
     try:

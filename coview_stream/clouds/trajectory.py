@@ -16,7 +16,7 @@ from coview_stream.geometry.validation import MAX_COORDINATE
 
 _TUM_COLUMNS = 8
 _MIN_QUATERNION_NORM = 1e-6
-_ROTATION_TOLERANCE = 1e-2
+_ROTATION_TOLERANCE = 1e-2  # greatest element of R R^T - I
 
 
 def read_tum(path: str | os.PathLike[str]) -> tuple[Floats, Poses]:

@@ -25,7 +25,7 @@ class DescriptorConfig:
 
     Attributes:
         radius: metres that a descriptor reaches, at most 200; the paper's.
-        rings: bins along the radius, at most 80; at most 4,800 in all sectors.
+        rings: bins along the radius, at most 80; ``rings`` times ``sectors`` is at most 4,800.
         sectors: bins around; a shift by one is a turn by 2 pi / ``sectors``.
         channels: descriptors that vote together: ``scan_context``, the greatest heights of all bins; ``coview``, those
             of co-visible bins; ``paper``, eqs 1-4 as printed. ``python -m bench ablation`` compares them.

@@ -13,7 +13,7 @@ from coview_stream.geometry.arrays import Floats
 from coview_stream.geometry.transforms import Points, Pose, exp_so3, pose_from, rot_z, transform
 
 MAX_LEVER = 100.0  # metres from the body's origin to the sensor; more means another unit
-_UPRIGHT = math.sin(math.radians(0.05))  # cosine of a pitch of 90 degrees at the resolution of an option
+_UPRIGHT = math.sin(math.radians(0.05))  # least cosine of a pitch that is not 90 degrees to the nearest 0.1
 
 
 @dataclass(frozen=True)
@@ -69,7 +69,7 @@ class Mount:
         return Mount(roll, pitch, yaw, x, y, z, self.drawn)
 
     def to_json(self) -> dict[str, float]:
-        """Plain data, with the unit in each name."""
+        """Return roll, pitch, yaw (degrees) and x, y, z (metres) as plain data, with the unit in each name."""
         angles = {f"{name}_deg": round(math.degrees(getattr(self, name)), 6) for name in ("roll", "pitch", "yaw")}
         return angles | {f"{name}_m": getattr(self, name) for name in ("x", "y", "z")}
 

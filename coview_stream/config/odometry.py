@@ -56,7 +56,7 @@ class LidarOdometryConfig:
 
 
 def down(gravity: Gravity) -> Floats:
-    """(3,) unit vector in the body frame that points down; not for ``"ground"``.
+    """Return the unit vector (3,) that points down, in the body frame; not for ``"ground"``.
 
     ConfigError for no vector, or one that leaves the body lying or upside down.
     """

@@ -17,7 +17,7 @@ Descriptor = npt.NDArray[np.float32]
 _GROUND_RADIUS = 6.0  # metres around a keyframe within which its virtual scan has ground points
 
 EYE = 1.7
-"""Height of the sensor above the ground in metres, if unknown."""
+"""Presumed height of the sensor above the ground, metres, where no ground shows it."""
 
 LOWEST_EYE = 0.3
 """Least height of a sensor above ground, metres: points less far below it are not taken for ground, but for walls."""

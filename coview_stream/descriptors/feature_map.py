@@ -32,8 +32,8 @@ from coview_stream.geometry.transforms import Points
 TILE = 32
 """Cells of 1 m along a tile's edge; tile (i, j) covers ``[32 i, 32 (i + 1))`` metres in x, likewise in y."""
 
-_NAMES = ("local", "sigma", "tiles", "place", "place_at")
-_SCALE = 127.0
+_NAMES = ("local", "sigma", "tiles", "place", "place_at")  # of the arrays, after ``learned.``
+_SCALE = 127.0  # the byte that stores 1
 _MIN_SIGMA, _MAX_SIGMA = 0.02, 50.0  # range of the stored sigmas
 _STEPS = 255.0 / np.log(_MAX_SIGMA / _MIN_SIGMA)  # of 3 %
 
@@ -231,7 +231,7 @@ WINDOW = 256
 """Metres along the edge of a window, which is drawn and encoded at once; a multiple of a tile's edge."""
 
 _DRAW_MARGIN = 48  # metres around a window whose points determine its ground
-_NET_MARGIN = 64  # metres around a window, the network's reach: 30 for its layers, 28 for GeM's disk
+_NET_MARGIN = 64  # metres around a window, the network's reach: 30 for its layers, 28 to pool global descriptors
 _KNOWN_RADIUS = 4  # metres around a point within which the map has features, to bridge shadows
 _CELLS = round(1 / CELL)  # image cells a metre
 _PER_PLACE = 2  # network's place cells along the edge of a stored one
@@ -363,7 +363,7 @@ def _in_tiles(values: npt.NDArray[Any]) -> npt.NDArray[Any]:
 
 
 def _places(place: Floats32, mapped: Bools, shape: tuple[int, int]) -> tuple[Int8s, Floats]:
-    """Pool global descriptors (K, P) over squares of 8 m, as a query pools its middle cells; return their centres."""
+    """Pool global descriptors (P, h, w) over mapped squares of 8 m, like a query's: (K, P), with the centres (K, 2)."""
     edge, side = round(_NET_MARGIN / PLACE_CELL), round(PLACE_CELL * _PER_PLACE)
     height, width = (n // side for n in shape)
     inner = place[:, edge : edge + _PER_PLACE * height, edge : edge + _PER_PLACE * width]

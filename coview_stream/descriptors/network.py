@@ -40,7 +40,7 @@ PLACE_CELL = 4.0
 """Edge of a cell of global descriptors, metres."""
 
 PLACE_REACH = 7
-"""Radius in cells of 4 m, thus 28 m, over which a global descriptor pools under a Gaussian window of 14 m."""
+"""Cells of 4 m to either side, thus 28 m, over which a global descriptor pools under a Gaussian window of 14 m."""
 
 PLACE_SIGMA = 3.5
 """Standard deviation of that window, cells of 4 m."""
@@ -51,12 +51,12 @@ MIN_SIGMA = 0.05
 MIN_ACTIVATION = 1e-4
 """Lower limit of activations that the generalised mean (GeM) raises to its power."""
 
-_MULTIPLE = 8  # image cells
+_MULTIPLE = 8  # image cells, of which height and width are multiples
 _STRIP = 1 << 18  # numbers in a strip's copied cells, 1 MB, which stays in the cache of a core
-_TINY = np.float32(1e-12)
+_TINY = np.float32(1e-12)  # lower limit of divisors and powers
 _REMEDY = "install the package again, or name your own weights' folder in COVIEW_WEIGHTS"
 
-_Run = Callable[[Callable[[int], None], Iterable[int]], Iterable[None]]
+_Run = Callable[[Callable[[int], None], Iterable[int]], Iterable[None]]  # map, or that of a pool
 
 
 @dataclass(frozen=True)

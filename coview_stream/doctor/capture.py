@@ -41,9 +41,9 @@ class CapturedMessage:
     """Description of one message."""
 
     arrived: float  # local time, seconds
-    key: str  # key expression of the sample
+    key: str  # key that it was published on
     encoding: str  # named by the sample; empty without one
-    size: int  # size in bytes
+    size: int  # bytes of the payload
     codec: str = ""  # codec that read it; empty if none could
     counter: str = ""  # name of the node's counter for a message that cannot be read
     reason: str = ""  # why it cannot be read
@@ -54,7 +54,7 @@ class CapturedMessage:
     # first and last point, seconds after the stamp; None without a time per point
     sweep: tuple[float, float] | None = None
     T_odom_body: Pose | None = None  # (4, 4) odometry; None for clouds
-    cloud: Points | None = None  # (N, 3) float32 sample of the finite points; None after the first clouds
+    cloud: Points | None = None  # (N, 3) float32, some of the finite points; None after the first 300 clouds
     doubles: bool = False  # float32 rows that only make sense as float64
 
 
@@ -62,7 +62,7 @@ class CapturedMessage:
 class RobotCapture:
     """Messages of one robot between the local times ``began`` and ``ended``, seconds, in order of arrival.
 
-    ``status`` is the newest one, ``servers`` the nodes that published any, ``alive`` a node's liveliness token.
+    ``status`` is the newest one, ``servers`` are the nodes that published any; ``alive``: a node holds its token.
     """
 
     keys: RobotKeys

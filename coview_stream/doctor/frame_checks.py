@@ -50,7 +50,7 @@ _TOO_FAR = math.radians(11.0)  # the localizer itself corrects leans of about te
 _SWAY = math.radians(9.0)
 _MOVING = 1.0  # metres
 
-_MIN_PAIRS = 3
+_MIN_PAIRS = 3  # of clouds, to say that the lidar moves although odometry does not
 _FAR = 5.0  # metres from the middle of the path: the middle of a cloud is only approximate
 _ABOVE = 1.0  # metres of a lidar above the ground, approximately
 IN_ODOMETRY = Reading(
@@ -63,7 +63,7 @@ ODOMETRY_IN_CENTIMETRES = Reading(
     "odometry is in centimetres", "send metres", change=lambda T: pose_from(T[:3, :3], _CENTIMETRE * T[:3, 3])
 )
 IN_MAP = Reading("clouds are in a map's frame, and do not move with the robot", IN_ODOMETRY.remedy)
-_GROUND_FRAMES = 16
+_GROUND_FRAMES = 16  # frames in which the ground is looked for
 _DRIVE = "drive ten metres past walls, poles or trunks, with a bend, and ask again"
 
 
@@ -158,7 +158,7 @@ def _middle(directions: Floats) -> tuple[Floats, float]:
 
 
 def _pairs(frames: Sequence[SeenFrame], ground: _Ground | None) -> tuple[list[Pair], str]:
-    """Return the lidar's motion between frames some metres apart, and any library that is missing for it."""
+    """Return the lidar's motions between frames a metre or more apart, with odometry, and any missing library."""
     if ground is None:
         return [], ""
     try:
@@ -181,8 +181,8 @@ def _explanations(
 ) -> list[Finding]:
     """Return the mistakes that explain why the lidar contradicts odometry: more than one if they do so equally well.
 
-    ``unit`` is the clouds' unit in metres, which they have been multiplied by. Probabilities are those among the tried
-    readings, "as sent" and "unrelated motions", all equally usual.
+    ``unit`` is the clouds' unit in metres, which they have been multiplied by. The tried readings, "as sent" and
+    "unrelated motions" are equally probable beforehand.
     """
     candidates: list[tuple[float, Finding]] = []
     sent = seen is not None and ground is not None and not ground.axis and unit == 1.0
@@ -249,7 +249,7 @@ _GUESSED = (
 
 
 def _of_fixed_frames(frames: Sequence[SeenFrame]) -> Iterator[tuple[Reading, list[SeenFrame]]]:
-    """Yield each fixed frame that the clouds may be in instead of the lidar's, and the clouds moved to the body.
+    """Yield readings with the clouds in a fixed frame, odometry's or a map's, and the clouds moved to the body.
 
     The middle of the points moves with the robot, which shows roughly where a map's frame has its origin and x axis.
     """

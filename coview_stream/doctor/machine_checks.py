@@ -26,12 +26,12 @@ from coview_stream.clouds.python_child import python_command, python_environment
 from coview_stream.doctor.finding import Finding
 from coview_stream.errors import PIP_INSTALL, install_command
 
-GB = 1e9
+GB = 1e9  # bytes
 MIN_MEMORY = 0.6 * GB
 """Bytes: a searching node takes 0.36 GB on a small map and 0.47 GB on 1 km2 (``python -m bench memory``)."""
 
 _TIMEOUT = 120.0  # seconds; compiling all kernels takes 3 to 10 on two cores
-_MIN_ZENOH = (1, 10)
+_MIN_ZENOH = (1, 10)  # oldest version that is tested
 _CODECS = {
     "rosbags.typesys": "rosbags",
     "foxglove_schemas_protobuf.PointCloud_pb2": "foxglove-schemas-protobuf",

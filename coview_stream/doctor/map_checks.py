@@ -82,11 +82,11 @@ def node_memory(base_map: BaseMap) -> float:
 
 
 # sizes of the sample
-_FRAMES, _WINDOWS = 80, 4
+_FRAMES, _WINDOWS = 80, 4  # frames at most, in this many stretches of a long run
 _APART = 1.0  # metres between frames, approximately
 _STANDING_STRIDE = 5  # frames, if odometry does not move
 _MIN_RATE, _MAX_RATE = 0.2, 100.0  # Hz; lidars send 1 to 30 frames per second
-_SEARCHED = 60  # frames
+_SEARCHED = 60  # frames given to the search, or up to twice as many of a short run
 _ENOUGH = 20.0  # metres: most robots are found within ten
 _BETWEEN = 0.21  # seconds between watched frames, at most: odometry in between does not hide accelerations
 _WATCHED = 1500  # frames: five minutes

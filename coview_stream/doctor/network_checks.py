@@ -39,14 +39,14 @@ _KEYS = (
     "**/@v0/*/pubsub/frame_transform/odometry/**",
 )
 _LISTEN = 2.0  # seconds: clouds come at 5 Hz or more
-_CLOUD = 100  # points, at least
+_CLOUD = 100  # points: a message on a key of no preset counts as a cloud from this many on
 _MAX_LISTED = 3  # candidates per line
 _MAX_CANDIDATES = 200  # a large site has more than anyone reads
 
 
 @dataclass(frozen=True, order=True)
 class Candidate:
-    """Clouds or odometry on the network."""
+    """Clouds or odometry found on the network, and how to subscribe to them."""
 
     channel: str  # cloud or odometry
     where: str  # key or topic

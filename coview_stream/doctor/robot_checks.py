@@ -29,7 +29,7 @@ _NODE = NodeConfig()
 _MIN_CLOUD_RATE, _MAX_CLOUD_RATE = 2.0, 30.0  # Hz; at 2 Hz and 5 m/s frames are 2.5 m apart
 _MIN_ODOMETRY_RATE = 5.0  # Hz; poses are published at 10 Hz, each with the newest odometry
 _MIN_PER_CLOUD = 0.9  # least odometry rate per cloud rate: one sample per cloud, with a margin
-_MIN_POINTS = 1000
+_MIN_POINTS = 1000  # finite points of a usual frame
 _OTHERS = 5  # robots that are named
 _MIN_DISTANCE, _MAX_DISTANCE = 0.3, 300.0  # metres; the median range of a lidar lies between, anywhere
 _NO_TILT = 1e-9  # radians
@@ -202,7 +202,7 @@ def gravity_finding(messages: Sequence[CapturedMessage], robot: str) -> Finding:
     return Finding("ok", "gravity", found, robot=robot)
 
 
-_MAX_LAG = 1.0  # seconds from the odometry at its stamp to a cloud's arrival; drivers take 0.05 to 0.3
+_MAX_LAG = 1.0  # seconds by which a cloud may arrive after the odometry of its stamp; drivers take 0.05 to 0.3
 _YEAR = 3.2e7  # seconds
 _MIN_PAIRED = 0.9  # share of clouds that find odometry
 _MAX_STATUS_AGE = 5.0  # seconds; a node publishes one per second
@@ -311,10 +311,7 @@ def captured_frames(capture: RobotCapture, mount: Mount | None = None) -> list[S
 
 
 def node_finding(capture: RobotCapture, sha256: str | None, others: Collection[str] = ()) -> Finding:
-    """Judge whether a node serves the robot, and its status; ``sha256`` is the expected map's, None: any map.
-
-    ``others`` are robots that nodes serve.
-    """
+    """Judge a robot's node and status; ``sha256``: of the map expected, None: any; ``others``: robots with a node."""
     robot, status = capture.keys.robot, capture.status
     if status is None and not capture.alive:
         remedy = f"`coview-stream serve SITE.coview --robot {robot}`"

@@ -32,13 +32,13 @@ _NEAR, _FAR = 1.5, 50.0  # metres from the lidar
 _NEIGHBOURS, _RADIUS = 20, 1.0  # for normals; metres
 
 AGREE = 3.0
-"""Sigmas per degree of freedom up to which two poses agree; chosen by hand, like the next."""
+"""Greatest :func:`off_by` of two poses that agree; chosen by hand, like the next."""
 _SIGMAS = np.array([np.radians(3.0)] * 3 + [0.7] * 3)  # radians and metres, prior on a registration's initial pose
 _SCALES = (1.6, 0.8, 0.4)  # metres
 _APART = 10.0  # largest distance between two registered keyframes, metres
 _LOOP = 30.0  # least metres driven between two registered keyframes of one run
 _OTHERS = 2  # keyframes per run to which a keyframe is registered, at most
-_ON_MAP, _ON_SUBMAP = 0.1, 0.3  # least inlier shares
+_ON_MAP, _ON_SUBMAP = 0.1, 0.3  # least shares of the scan's kept points that find a partner
 _MATCH = 0.5  # largest distance between points of one surface, metres
 _FLAT = 0.5  # least planarity of a surface from which distances are measured
 
@@ -129,7 +129,7 @@ class Registrar:
         self._config = RegistrationConfig()
 
     def to_map(self, k: int) -> Constraint | None:
-        """Register submap ``k`` to the base map from the pose of ``locate``; None if the inlier share is too small.
+        """Register submap ``k`` to the base map from the pose of ``locate``; None if that fails or too few points pair.
 
         If the result agrees with the pose of ``locate``, that pose is taken: it includes all earlier registrations.
         """
@@ -141,7 +141,7 @@ class Registrar:
         return replace(constraint, T=T_located)
 
     def to_submap(self, k: int, other: int) -> Constraint | None:
-        """Register submap ``k`` to another from the poses of ``locate``; None if the inlier share is too small."""
+        """Register submap ``k`` to another from the poses of ``locate``; None if that fails or too few points pair."""
         target = self.submaps[other].target
         T_start = inverse(self.submaps[other].T_map_body) @ self.submaps[k].T_map_body
         back = self.submaps[other].T_submap_body
@@ -189,7 +189,7 @@ class Registrar:
 
 
 def off_by(constraint: Constraint, T: Pose) -> float:
-    """Return the distance of a pose (4, 4) from a constraint, sigmas per degree of freedom."""
+    """Return the distance of a pose (4, 4) from a constraint: root mean square of the six errors in sigmas."""
     gap, R = boxminus(constraint.T, T), constraint.T[:3, :3]
     gap = np.concatenate([gap[:3] @ R, gap[3:] @ R])
     return float(np.sqrt(gap @ np.linalg.solve(constraint.covariance, gap) / 6.0))

@@ -34,13 +34,13 @@ def records(points: Floats, source: npt.ArrayLike, change: npt.ArrayLike, stamp:
     return rows
 
 
-_CELL = 0.5  # metres
+_CELL = 0.5  # metres, of the raster of greatest heights
 _AROUND = 5  # cells: eaves and crowns hide objects within a metre
-_MAX_CELLS = 400_000_000
+_MAX_CELLS = 400_000_000  # 100 km2, 1.6 GB
 
 
 def top_around(base_map: BaseMap, points: Points) -> Floats32:
-    """Return the greatest height (N,) of the map around points (N, 3), minus infinity where it has no points.
+    """Return the greatest height (N,) of the map within a metre of points (N, 3); minus infinity without map points.
 
     A survey from above would show a higher object; it may miss a lower one, which is a facade or hidden below a roof
     or a crown.
@@ -64,7 +64,7 @@ def _within_raster(cells: Floats, raster: npt.NDArray[Any]) -> tuple[Ints, tuple
 
 
 Progress = Callable[[int, int, str], None]
-"""Called with (frames done, frames, name of the step)."""
+"""Called with the number of frames (or pairs of submaps) done, that of all, and the name of the step."""
 
 _CHUNK = 500_000
 _LOOKS = 3  # least looks through a point that is absent
@@ -81,7 +81,7 @@ class FuseConfig:
         voxel: metres; one point of all runs per cube of this size, and none this near to the map's points.
         range_min: metres from the lidar; nearer points may be the robot itself.
         range_max: metres from the lidar; farther points suffer from errors of the pose's angles.
-        keep_moving: keep people and cars, which other rays went through.
+        keep_moving: keep people and cars, that is points through which other rays went.
         changes: mark new and vanished points.
 
     Raises:
@@ -151,7 +151,7 @@ def fuse(
 
     Raises:
         InputError: a frame lies too far from the map.
-        CloudError: no point of the runs is in range.
+        CloudError: no point of the runs is in range. ValueError: their bounding rectangle is larger than 100 km2.
     """
     config = config or FuseConfig(voxel=base_map.config.voxel)
     table, taken = _surfaces(runs, config, progress)

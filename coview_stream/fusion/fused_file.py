@@ -24,7 +24,7 @@ _PCD_TYPES = {"f8": "8 F", "u2": "2 U", "u1": "1 U"}
 
 
 def check_name(path: Path, inputs: Iterable[Path]) -> None:
-    """Raise CloudError for an unknown suffix or the name of an input, DependencyError for LAS without laspy."""
+    """Raise CloudError for another suffix, a directory or an input's name, DependencyError for LAS without laspy."""
     if path.suffix.lower() not in SUFFIXES:
         raise CloudError(f"{path}: name a cloud, one of {', '.join(SUFFIXES)}")
     if path.is_dir() or not path.resolve().parent.is_dir():

@@ -7,7 +7,7 @@ given
 * odometry within a run: e(Z_k, X_{k-1}^-1 X_k) ~ N(0, Q_k), Q estimated from the registrations, as in tracking
 * registrations of overlapping submaps, from two runs or from one run at two times: e(Z_jk, X_j^-1 X_k) ~ N(0, R_jk)
 
-all under Cauchy's kernel. Held-out pairs of submaps decide whether the result is better.
+all under Cauchy's kernel, beside a weak prior at ``locate``'s poses. Held-out pairs of submaps judge the result.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ from coview_stream.localization.tracking.motion import DriftEstimator, worth_lea
 
 # chosen by hand
 _KERNEL = 3.0  # sigmas, scale of Cauchy's weights
-_ANYWHERE = np.array([np.radians(10.0)] * 3 + [3.0] * 3)  # sigmas of a pose without other constraints
+_ANYWHERE = np.array([np.radians(10.0)] * 3 + [3.0] * 3)  # sigmas of the weak prior: radians, metres
 _HELD_OUT = 4  # every fourth pair is held out to judge the result
 _MIN_HELD_OUT = 3
 _MAP_WORSE, _MAP_ROUNDING = 1.05, 0.002  # factor and metres by which the distance to the map may grow
@@ -38,7 +38,7 @@ _MAP_WORSE, _MAP_ROUNDING = 1.05, 0.002  # factor and metres by which the distan
 
 @dataclass(frozen=True)
 class Judgement:
-    """Median distances between surfaces before and after the adjustment, metres; NaN if there are none."""
+    """Distances between surfaces before and after the adjustment, means over medians, metres; NaN if there are none."""
 
     runs: tuple[float, float]  # between held-out submaps
     to_map: tuple[float, float]  # between submaps and the base map
@@ -62,7 +62,7 @@ class Joint:
     between: int  # used pairs of submaps from two runs
     loops: int  # used pairs of submaps from one run
     held_out: int  # pairs that judge the result
-    residuals: tuple[float, float]  # median |e| of the used pairs before and after, sigmas
+    residuals: tuple[float, float]  # median residual (off_by) of the used pairs before and after, sigmas
     judgement: Judgement | None  # None if too few pairs are held out
 
     @property
@@ -106,10 +106,7 @@ def adjust(
         base_map: the map on which the runs were localized.
         runs: one or more runs.
         progress: called after each step.
-        relative: use registrations between submaps; False compares with the map and odometry alone.
-
-    Raises:
-        CloudError: a frame cannot be read.
+        relative: use registrations between submaps; False adjusts by the map and odometry alone, for comparison.
     """
     submaps: list[Submap] = []
     for number, run in enumerate(runs):
@@ -190,7 +187,7 @@ def _solved(submaps: Sequence[Submap], on_map: Sequence[Constraint], relative: S
 
 
 def _residual(constraints: Sequence[Constraint], poses: Floats) -> float:
-    """Return the median whitened residual between submaps, sigmas per degree of freedom."""
+    """Return the median residual (:func:`off_by`) of constraints between submaps, sigmas."""
     if not constraints:
         return float("nan")
     return float(np.median([off_by(c, inverse(poses[c.target]) @ poses[c.source]) for c in constraints]))

@@ -18,7 +18,7 @@ REACH = 25.0
 
 _PIXEL = np.radians(0.5)  # of the range image; 0.2 m at ``REACH``
 _COLUMNS, _ROWS = 720, 361
-_NEAREST, _STEEPEST = 1.5, np.radians(70.0)
+_NEAREST, _STEEPEST = 1.5, np.radians(70.0)  # metres; radians above or below the lidar's horizon
 _TILE = 8.0  # metres, for the look-up of points
 
 
@@ -39,7 +39,7 @@ class Sightings:
     """
 
     def __init__(self, points: Points, margin: float) -> None:
-        """Take points (N, 3) relative to the map's origin; a ray through one ends ``margin`` metres or more behind."""
+        """Take points (N, 3), map axes; a ray through one ends ``margin`` metres plus 1 % of its range behind it."""
         self.order, self._tiles, self._begin = by_square(points, _TILE)
         self.points = points[self.order]
         self._margin = margin
@@ -92,9 +92,9 @@ def looks_at(stamps: Floats, positions: Floats) -> Bools:
     return chosen
 
 
-_BITS = 21
+_BITS = 21  # of a key, for each axis
 _HALF = 1 << (_BITS - 1)
-_BUFFER = 2_000_000  # rows to merge later: 100 MB
+_BUFFER = 2_000_000  # rows that wait until they are merged: 68 MB
 
 ROW = np.dtype([("key", "<i8"), ("hits", "<u4"), ("sum", "<f4", 3), ("stamp", "<f8"), ("source", "<u2")])
 """A voxel: key, number of frames with a point in it, sum of these points from its corner, last stamp, first run."""
@@ -178,7 +178,7 @@ _TREE_TILE = 50.0  # metres: one search tree at a time, of some 100,000 points a
 def distances(points: Points, around: Callable[[Floats, float], Points], reach: float) -> Floats32:
     """Return the distance (N,) of points (N, 3) to the nearest other point, infinity beyond ``reach``.
 
-    ``around`` returns the other points within a radius of a position (2,).
+    ``around`` returns at least the other points within a radius of a position (2,).
     """
     from scipy.spatial import cKDTree
 
@@ -195,7 +195,7 @@ def distances(points: Points, around: Callable[[Floats, float], Points], reach: 
 
 
 def within(points: Points) -> Callable[[Floats, float], Points]:
-    """Return a function that finds points (N, 3) around a position, for :func:`distances`."""
+    """Return a function that finds points (N, 3) in a square around a position, for :func:`distances`."""
     order = np.argsort(points[:, 0], kind="stable")
     x = points[order, 0]
 

@@ -1,1 +1,1 @@
-"""Transforms, rotations, SE(3) and rasters: plain NumPy, nothing about lidar."""
+"""Poses, planar motions, rasters, distributions, protection levels, and checks of input arrays, in plain NumPy."""

@@ -77,7 +77,7 @@ def log_so3(R: Reals) -> Floats:
 
 
 def quat_to_matrix(quaternions: npt.ArrayLike) -> Floats:
-    """Return rotation matrices (..., 3, 3) of quaternions (..., 4) of any nonzero length."""
+    """Return rotation matrices (..., 3, 3) of quaternions (..., 4), x y z w, of any nonzero length."""
     q = np.asarray(quaternions, dtype=np.float64)
     x, y, z, w = np.moveaxis(q / np.linalg.norm(q, axis=-1, keepdims=True), -1, 0)
     R = np.empty((*q.shape[:-1], 3, 3))
@@ -91,7 +91,7 @@ def quat_to_matrix(quaternions: npt.ArrayLike) -> Floats:
 
 
 def matrix_to_quat(R: Reals) -> Floats:
-    """Return unit quaternions (..., 4) of rotation matrices (..., 3, 3); the largest component is positive."""
+    """Return unit quaternions (..., 4), x y z w, of rotations (..., 3, 3); the largest component is positive."""
     M = np.asarray(R, dtype=np.float64)
     xx, yy, zz = M[..., 0, 0], M[..., 1, 1], M[..., 2, 2]
     x, y, z = M[..., 2, 1] - M[..., 1, 2], M[..., 0, 2] - M[..., 2, 0], M[..., 1, 0] - M[..., 0, 1]
@@ -126,7 +126,7 @@ def pose_from(rotation: npt.ArrayLike, translation: npt.ArrayLike) -> Pose:
 
 
 def inverse(T: Pose) -> Pose:
-    """Invert a rigid transform, without a general matrix inversion."""
+    """Return the inverse of a rigid transform (4, 4), without a general matrix inversion."""
     R_t = T[:3, :3].T
     return pose_from(R_t, -R_t @ T[:3, 3])
 
@@ -169,7 +169,7 @@ def wrap_angle(angle: float) -> float:
 
 def rotation_angle(T: Pose) -> float:
     """Return the angle of the rotation part, radians in [0, pi]."""
-    # the sine stays precise near zero, where the cosine of eq. 15 has lost all precision
+    # near zero the sine stays precise, while the cosine (eq. 15) loses all precision
     (a, b, c), (d, e, f), (g, h, i) = T[:3, :3].tolist()
     sine = 0.5 * math.hypot(h - f, c - g, d - b)
     return math.atan2(sine, 0.5 * (a + e + i - 1.0))
@@ -181,7 +181,7 @@ def tilt_of(T: Pose) -> float:
 
 
 def orthonormal(T: Pose) -> Pose:
-    """Return ``T`` with its rotation projected back onto SO(3) (drift from repeated products)."""
+    """Return ``T`` with the nearest exact rotation, as repeated products accumulate rounding errors."""
     return pose_from(nearest_rotation(T[:3, :3]), T[:3, 3])
 
 

@@ -44,10 +44,7 @@ def to_array(
 
 
 def cloud_rows(cloud: npt.ArrayLike) -> Points:
-    """Return the points (N, 3) float32 of (N, 3) rows, or of (N, 4) with an intensity, without a copy.
-
-    CloudError for other shapes.
-    """
+    """Return the points (N, 3) float32 of rows (N, 3), or (N, 4) with an intensity; CloudError for other shapes."""
     rows = to_array(cloud, np.float32, "cloud")
     if rows.ndim == 2 and rows.shape[1] in (3, 4):
         return rows[:, :3]
@@ -106,10 +103,7 @@ def check_rigid(T: npt.ArrayLike, name: str, error: type[InputError] = InputErro
 
 
 def validate_odometry(T_odom_body: npt.ArrayLike, stamp: float, newest: float | None = None) -> Pose:
-    """Return a frame's pose (4, 4), exactly rigid.
-
-    RunError if it is not a pose, or its stamp is not finite, not in seconds or not after ``newest``.
-    """
+    """Return a frame's pose (4, 4), exactly rigid; RunError if it is no pose, or as :func:`check_stamp`."""
     check_stamp(stamp, newest)
     return check_rigid(T_odom_body, "T_odom_body", RunError)
 

@@ -88,9 +88,9 @@ class RecordingLocalizer(Localizer):
         )  # fmt: skip
 
     def fit(self, cloud: Points, T_map_body: Pose, calibration: Calibration) -> float:
-        """Return the share of a frame's structure on the map at a body pose (4, 4); 0 for too few points.
+        """Return the share of a frame's structure that lies on the map at a body pose (4, 4); 0 for too few points.
 
-        The cloud (N, 3) is in the sensor's axes; ``calibration`` is the one that the pose was computed with.
+        The pose is about the map's origin, computed with ``calibration``; the cloud (N, 3) is in the sensor's axes.
         """
         target = self._local_maps.around(T_map_body[:3, 3])
         points = transform(pose_from(T_map_body[:3, :3], np.zeros(3)), calibration.level(cloud))

@@ -20,8 +20,8 @@ from coview_stream.localization.calibration.odometry_history import Moment
 from coview_stream.localization.witness.first_motions import Conventions
 
 _FASTEST = 50.0  # metres per second; no robot drives faster
-_FASTER = 3.0  # factor on the fastest of the steps before, as frames without stamps count as 0.1 s apart
-_BEFORE = 10  # steps
+_FASTER = 3.0  # factor on the fastest of the earlier steps, as frames without stamps count as 0.1 s apart
+_BEFORE = 10  # earlier steps, of which the fastest counts
 _SHORT_JUMP = 1.0  # metres; a shorter step is never a jump
 _PLACE_TILT = math.radians(0.5)  # sigma of roll and pitch of a frame registered at the right place
 
@@ -30,11 +30,11 @@ _PLACE_TILT = math.radians(0.5)  # sigma of roll and pitch of a frame registered
 class PreparedFrame:
     """One frame, checked and corrected."""
 
-    cloud: Points  # (N, 3) float32, the sensor's own axes
+    cloud: Points  # (N, 3) float32 in the sensor's axes: as received, not levelled by the calibration
     T_odom_body: Pose  # (4, 4) corrected odometry at the moment of the cloud, about the anchor
     T_odom_raw: Pose  # (4, 4) raw odometry at the stamp
     stamp: float  # seconds
-    scan: RawScan  # one point per voxel
+    scan: RawScan  # its points, one per voxel
 
 
 class FramePreparation:
@@ -43,7 +43,7 @@ class FramePreparation:
     Attributes:
         estimator: of the calibration; learns from registrations too.
         conventions: check of units and axes.
-        steps: check of odometry's steps.
+        steps: check of odometry for jumps.
         anchor: (3,) origin of the current odometry, near which float32 is exact; None before the first frame.
     """
 
@@ -72,7 +72,7 @@ class FramePreparation:
         self.anchor = self._newest = None
 
     def forget_odometry(self) -> None:
-        """Keep the next frame unconnected to earlier ones, as odometry may have jumped."""
+        """Measure no motion to the next frame, and take its position as anchor, as odometry may have jumped."""
         self.forget_keyframe()
         self.anchor = None
 
@@ -119,7 +119,7 @@ class FramePreparation:
         return PreparedFrame(raw, T, T_raw, stamp, RawScan(points, T, self.calibration, moment))
 
     def knows_moment(self, stamp: float) -> bool:
-        """Return whether odometry reaches back to a cloud's moment, with a delay of 2 sigma below the estimate."""
+        """Return whether odometry reaches back to a cloud's moment if its delay is 2 sigma below the estimate."""
         late = self.calibration.delay - 2.0 * self.calibration.sigma_delay
         return late <= 0.0 or self.estimator.history.covers(stamp - late, stamp)
 
@@ -181,10 +181,10 @@ class OdometryCorrection:
     def __init__(self) -> None:
         self._before: Pose | None = None  # raw
         self._position = np.zeros(3)
-        self._turned = 0.0
+        self._turned = 0.0  # radians about the vertical, by all corrections
 
     def correct(self, T_odom_body: Pose, calibration: Calibration, before: Pose | None = None) -> Pose:
-        """Return the next corrected pose (4, 4), odometry <- body; raw pose ``before`` replaces the previous one."""
+        """Return the next raw pose (4, 4), corrected; ``before`` is the previous one, if a new delay has changed it."""
         if self._before is not None and before is not None:
             self._before = before
         if self._before is None:

@@ -35,7 +35,7 @@ from coview_stream.localization.witness.first_motions import DOUBT
 from coview_stream.localization.witness.witness import Witness
 
 JUMPED = "searching anew: odometry jumped"
-_DEFERRED = 3.0  # factor on the metres and seconds between deferred registrations
+_DEFERRED = 3.0  # factor on the metres, radians and seconds between registrations where the caller is behind
 
 
 class Localizer(SavedState):
@@ -44,8 +44,8 @@ class Localizer(SavedState):
     Attributes:
         base_map: the map; may be shared by many localizers.
         config: settings of the decisions.
-        state: of the newest fix.
-        search: with the names of its recognizers (``names``) and the newest descriptors (``last_query``).
+        state: present state of localization.
+        search: the search; ``names`` are those of its recognizers, ``last_query`` the newest keyframe's descriptors.
     """
 
     def __init__(
@@ -61,13 +61,11 @@ class Localizer(SavedState):
             base_map: the map, or the path of its ``.coview`` file, which is loaded and checked.
             config: settings of the decisions; None takes the defaults.
             local_maps: cache of map crops; localizers of one thread may share it.
-            index: of the search; may be shared likewise.
+            index: data of the search's recognizers, which localizers of one map may share; None builds it.
 
         Raises:
-            ConfigError: ``config`` has another type.
-            InputError: ``base_map`` has another type.
-            MapError: the file cannot be loaded.
-            MapError, InputError: ``config.reloc`` is ``learned``, which cannot be used here.
+            ConfigError, InputError: ``config`` or ``base_map`` has another type.
+            MapError, InputError: the file cannot be loaded, or ``config.reloc`` is ``learned``, which cannot be used.
         """
         self.base_map, self.config = checked_arguments(base_map, config)
         self._local_maps = local_maps or LocalMaps(self.base_map, self.config.registration.source_range)
@@ -129,7 +127,7 @@ class Localizer(SavedState):
         return 1.0 if self._frames.conventions.finding is not None else self._witness.faults.sensors
 
     def prepare(self) -> None:
-        """Load and compile ahead of the first search and registrations: some seconds, once.
+        """Load data and compile kernels ahead of the first search and registrations; takes some seconds, once.
 
         Raises:
             InputError: the network of the learned features cannot be loaded.
@@ -152,10 +150,11 @@ class Localizer(SavedState):
             The fix; its pose is None unless the state is TRACKING.
 
         Raises:
-            CloudError: the cloud has another shape or fewer than 10 finite points. RunError: the pose or stamp is not
-                finite or not rigid. Neither changes the localizer: count the frame, skip it and go on.
+            CloudError: the cloud has another shape, fewer than 10 finite points, or lies kilometres off. RunError: the
+                pose is not rigid, or the stamp is not in seconds or not after the previous frame's. Neither changes the
+                localizer: count the frame, skip it and go on.
         """
-        frame, request = self._predict(cloud, T_odom_body, stamp)  # T_map_odom T_odom_body
+        frame, request = self._predict(cloud, T_odom_body, stamp)  # T_map_body = T_map_odom T_odom_body
         if self.state.has_place:
             match = self._match_to_map(frame)  # eq. 13, from the prediction; None where none is due
             if match is not None:
@@ -170,8 +169,9 @@ class Localizer(SavedState):
     ) -> SearchRequest | None:  # fmt: skip
         """Process a frame as :meth:`step` does, with its first arguments and its errors, but without the search.
 
-        With ``defer`` the caller is behind: while tracking, only every third metre is registered where that suffices.
-        ``on_doubt`` is called if the frame contradicts the place, some tenths of a second before the cause is known.
+        Set ``defer`` if the caller is behind: while tracking, frames are then registered at three times the usual
+        distance, turn and time, unless they look displaced or the place is in doubt. ``on_doubt`` is called if a
+        registration contradicts the place, some tenths of a second before the cause is known.
 
         Returns:
             The search request, if any: pass it to a :class:`GlobalSearch` in any thread or process, and its result to
@@ -186,7 +186,8 @@ class Localizer(SavedState):
     def apply_search_result(self, result: SearchResult) -> None:
         """Track the place that a search has accepted, or record why it accepted none.
 
-        Results from before a loss or a :meth:`reset` are ignored, as are all results while a place is known.
+        A result of an earlier epoch (from before a loss, a jump of odometry, another circle or a :meth:`reset`) is
+        ignored, as are all results while a place is known.
         """
         newest = self._newest
         if result.epoch != self._requests.epoch or self.state.has_place or newest is None:
@@ -245,7 +246,7 @@ class Localizer(SavedState):
         )
 
     def take_events(self) -> tuple[Event, ...]:
-        """Return the events that changed the state since the last call, in order; :meth:`reset` drops them."""
+        """Return the events that changed the state since the last call, in order; :meth:`relocalize` drops them."""
         events, self._events = tuple(self._events), []
         return events
 
@@ -254,8 +255,8 @@ class Localizer(SavedState):
     def hint_pose(self, T_map_body: Pose) -> None:
         """Hint that the robot may be here at the next frame: ``T_map_body`` (4, 4) as :attr:`Fix.T_map_body`.
 
-        A hint holds until a place is accepted or :meth:`reset`. The search judges it like the last hypothesis of the
-        votes. Ignored while a place is known.
+        A hint holds until a place is accepted, :meth:`relocalize` or :meth:`reset`. The search judges it like a
+        hypothesis that the votes rank last. Ignored while a place is known.
 
         Raises:
             RunError: it is not a finite rigid transform, or not on this planet.
@@ -304,7 +305,7 @@ class Localizer(SavedState):
     # ---- the steps
 
     def _predict(self, cloud: Reals, T_odom_body: Pose, stamp: float) -> tuple[PreparedFrame, SearchRequest | None]:
-        """Check a frame and predict its pose by odometry; return it and the search request, if no place is known."""
+        """Check a frame and predict its pose by odometry; return it and the request of a search, if one is due."""
         points, T_odom_raw = self._frames.validate(cloud, T_odom_body, stamp)
         if self._frames.steps.add(T_odom_raw, stamp):
             self._requests.odometry_jumped(None if self._newest is None else self._newest.T_odom_body)
@@ -370,7 +371,7 @@ class Localizer(SavedState):
     def _match_to_map(
         self, frame: PreparedFrame, defer: bool = False, on_doubt: Callable[[], None] = lambda: None
     ) -> MapMatch | None:
-        """Register the newest scans if due: after a metre, a second, or when they look displaced."""
+        """Register the newest scans after a metre, a turn or a second, in doubt, or if displaced; None if not due."""
         if self._frames.conventions.doubtful:
             return None
         patience = _DEFERRED if defer else 1.0

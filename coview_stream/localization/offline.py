@@ -50,13 +50,13 @@ TRAJECTORY_PNG, DESCRIPTORS_PNG = "trajectory.png", "descriptors.png"
 
 @dataclass(frozen=True)
 class Interruption:
-    """Frames with a common reason: without a pose after the first fix, or with a reported fault.
+    """Span of frames without a pose after the first fix, or with a reported fault.
 
     Attributes:
         first: stamp of the first frame, seconds.
         last: stamp of the last frame.
         frames: number of frames.
-        reason: of most frames.
+        reason: newest one with the most frequent cause.
     """
 
     first: float
@@ -100,7 +100,7 @@ class RunResult:
     Attributes:
         frames: number of frames in the run.
         fixes: one per usable frame, in order.
-        keyframes: evidence of every keyframe.
+        keyframes: evidence of every keyframe and, while tracking, registration, in order.
         skipped: file and reason of every unusable frame.
         seconds: duration of each step; empty if unknown.
         query: descriptors of the keyframe of the first fix, if any.
@@ -141,7 +141,7 @@ class RunResult:
 
     @property
     def trusted(self) -> bool:
-        """Whether there are poses, and one is later than all that contradicts the input's conventions."""
+        """Whether there are poses, the last one no earlier than the last frame with a fault of units or axes."""
         told = self.faults.get(RejectionReason.CONVENTIONS)
         return bool(self.posed) and (told is None or self.posed[-1].stamp >= told.last)
 
@@ -212,7 +212,7 @@ class RunResult:
     def to_json(self, base_map: BaseMap) -> dict[str, Any]:
         """Plain data of ``result.json``: poses map <- body and map <- odom, seconds, metres.
 
-        ``confidence`` is the one of the search that accepted the first fix's place.
+        ``confidence`` is the first fix's.
         """
         last = self.posed[-1] if self.posed else None
         evidence = self.fixes[-1].evidence if self.fixes else None
@@ -257,13 +257,13 @@ def locate(
         base_map: the map.
         run: the run.
         config: of the localizer.
-        progress: called with the number of finished frames, the number of all frames, and the newest fix.
+        progress: called with the numbers of finished and of all frames, and the frame's fix, None if it is skipped.
         guess: of the place at the first frame; only its circle is trusted.
         smooth: add poses by the whole run, also of frames without a live pose (``smoothed``).
 
     Raises:
-        InputError: no frame could be used (the message ends with the first frame's error), or the map has no ground at
-            the guess.
+        MapError, InputError: as :class:`Localizer`; no frame could be used (the message ends with the first frame's
+            error); or the map has no ground at the guess.
     """
     if run.mount is not None and not run.mount.drawn:
         config = replace(config or LocalizerConfig(), mount_drawn=False)

@@ -36,11 +36,11 @@ class KeyframeEvidence:
         stamp: seconds.
         state: after the decision.
         reason: one clause for people.
-        score: evidence score of the best hypothesis, 0 without one.
-        rival: field score of the most probable other place, which is not registered; 0 without one.
+        score: :attr:`Evidence.score` of the most probable or the tracked place; 0 without one.
+        rival: score of the most probable other place by the likelihood field; 0 without one, and while tracking.
         evidence: parts of the score, if a hypothesis could be registered.
-        station: winning station of a search.
-        shift: winning shift of the co-view descriptors; None if learned features named the place.
+        station: of the most probable place of a search; None if no vote named it, and while tracking.
+        shift: sectors by which it is turned (eq. 9); None likewise, and if learned features named the place.
         cause: of the decision, while tracking; None from a search.
         innovation: squared Mahalanobis distance, 6 degrees of freedom, between the registration and odometry's
             prediction; None without a registration, and from a search.
@@ -133,7 +133,7 @@ class Fix:
         stamp: of the frame, seconds.
         state: see :class:`~coview_stream.localization.state.State`.
         T_map_body: (4, 4) float64 in the frame of the map's sources; None unless TRACKING.
-        T_map_odom: (4, 4) float64 correction of odometry; None unless TRACKING.
+        T_map_odom: (4, 4) float64, leads from the frame's raw odometry pose to ``T_map_body``; None unless TRACKING.
         covariance: (6, 6) over (x, y, z, roll, pitch, yaw), m2 and rad2; None unless TRACKING. The angles are small
             rotations about the map's axes x, y and z (up), not the body's own roll and pitch. It is relative to the
             map, without the error of its georeferencing, and calibrated on simulated drives: see docs/tracking.md. One
@@ -144,7 +144,7 @@ class Fix:
         drift: rates of odometry's drift, to propagate this pose; None unless TRACKING.
         protection: metres and degrees that the pose's error, relative to the map, exceeds at most once in a thousand
             poses: see docs/tracking.md; None unless TRACKING.
-        calibration: corrections of sensor tilt and odometry, in any state; measured from the second keyframe on.
+        calibration: corrections of clouds and odometry, in any state; measured from the second keyframe on.
     """
 
     stamp: float
@@ -165,7 +165,7 @@ class Fix:
         has ``driven`` metres and ``turned`` radians.
 
         Raises:
-            ValueError: this fix has no pose.
+            ValueError: this fix lacks its pose, ``T_map_odom``, covariance or drift.
         """
         if self.T_map_odom is None or self.T_map_body is None or self.covariance is None or self.drift is None:
             raise ValueError("a fix without a pose corrects nothing")

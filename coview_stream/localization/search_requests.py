@@ -50,7 +50,7 @@ class SearchRequests:
         self._odometry_check = OdometryCheck()
 
     def add(self, frame: PreparedFrame, travelled: float) -> SearchRequest | NoSearch | None:
-        """Add a frame after ``travelled`` metres; return the request of the keyframe that it completes, if any."""
+        """Add a frame after ``travelled`` metres; return the request of a keyframe that is complete, or why none is."""
         anchor, calibration = self._frames.anchor, self._frames.calibration
         assert anchor is not None  # a frame has been prepared
         keyframe = self._buffer.add(frame.scan, frame.stamp, rays := RangeImage.rays(frame.cloud))

@@ -110,9 +110,9 @@ class _Chain:
     odometry: Poses  # (N, 4, 4) corrected
     registered: dict[int, BelievedRegistration]  # by frame, in order
     keys: Ints  # (M,) frames with a registration
-    measured: dict[int, Pose]  # (4, 4) body pose, by frame
+    measured: dict[int, Pose]  # (4, 4) registered body poses, about the map's origin, by frame
     driven: Floats  # (N,) metres up to each frame
-    spread: Floats  # (N, 6, 6) of the motion from the previous frame, over (rx, ry, rz, x, y, z), map axes
+    spread: Floats  # (N, 6, 6) covariances of the motions from the previous frame, (rx, ry, rz, x, y, z), map axes
     # (N, 4, 4) motion of the body from the moment of the cloud, which may be late, to the stamp
     since_cloud: Poses = field(kw_only=True)
     rates: Floats = field(kw_only=True)  # (N, 3) rates of the body, as in a Moment
@@ -205,8 +205,8 @@ class _Chain:
     def settle_breaks(self, fit: Callable[[int, Pose], float]) -> None:
         """Compare the last live poses before each break with the poses predicted from the registration after it.
 
-        Where the latter fit the map better, the break moves to before the frame. A frame that is not next to the break,
-        or that fits at neither pose, gets none. ``fit`` returns how well a frame fits at a pose (4, 4).
+        Where the latter fit the map better, the break moves to before the frame. A frame that fits better there, but is
+        not next to the break, or that fits at neither pose, gets no pose. ``fit`` returns the fit at a pose (4, 4).
         """
         for at, (before, after) in list(self.broken.items()):
             first = at

@@ -6,8 +6,8 @@ codec         in                                           out
 ``xyz``       clouds: float32 rows, stamp attached         the same
 ``xyzi``      the same with a fourth column                the same
 ``json``      odometry, poses                              odometry, poses
-``cdr``       PointCloud2, Odometry,                       the same
-              PoseWithCovarianceStamped
+``cdr``       PointCloud2 (or Livox CustomMsg), Odometry,  PointCloud2, Odometry,
+              PoseWithCovarianceStamped                    PoseWithCovarianceStamped
 ``foxglove``  PointCloud; PoseInFrame or FrameTransform    PointCloud; PoseInFrame
 ``keelson``   the same, each in a core.Envelope            PointCloud; FrameTransform, each in a core.Envelope
 ============  ===========================================  ===================================================

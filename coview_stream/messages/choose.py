@@ -27,7 +27,7 @@ _MIMES: dict[str, tuple[str, ...]] = {
 _MUTE = ("", "application/octet-stream", "zenoh/bytes", "zenoh/string")  # meaningless without a schema
 _WITHOUT_SCHEMA = ("application/json", "text/json")  # parameters are a charset or similar
 _LIVOX = ("livox_ros_driver2", "livox_ros_driver", "livox_interfaces")
-_SCHEMAS: dict[str, tuple[str, tuple[MessageKind, ...]]] = {
+_SCHEMAS: dict[str, tuple[str, tuple[MessageKind, ...]]] = {  # codec of each schema, and the kinds that it carries
     "xyz": ("xyz", ("cloud",)),
     "xyzi": ("xyzi", ("cloud",)),
     "sensor_msgs.pointcloud2": ("cdr", ("cloud",)),

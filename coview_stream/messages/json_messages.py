@@ -22,7 +22,7 @@ from coview_stream.messages.types import (
 from coview_stream.messages.validation import check_size, checked_pose, stamp_from
 
 _MAX_BYTES = 64 * 1024  # a pose takes 0.8 kB
-_MAX_STATUS_BYTES = 1024 * 1024  # a status takes a few kB per robot
+_MAX_STATUS_BYTES = 1024 * 1024  # a node's status of a robot has 3.5 kB at most
 _MAX_HYPOTHESES_BYTES = 16 * 1024  # ours stay below 3 kB
 _MAX_PLACES = 64  # a newer node may send more hypotheses than this one
 _PLACE_DIGITS = {"x": 2, "y": 2, "z": 2, "yaw": 3, "probability": 6, "log_ratio": 1}

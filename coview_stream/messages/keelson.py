@@ -13,9 +13,9 @@ from coview_stream.messages.types import CloudMessage, Encoded, OdometryMessage,
 from coview_stream.messages.validation import bare_pose, stamp_split
 
 _ENCODING = "application/protobuf;core.Envelope"
-_ENCLOSED_AT = 1
+_ENCLOSED_AT = 1  # number of the field
 _PAYLOAD = 2
-_MAX_ENTRIES = 64
+_MAX_ENTRIES = 64  # fields of an envelope; usual are two
 
 
 def _open(envelope: bytes) -> memoryview:

@@ -80,7 +80,7 @@ class CloudMessage:
 class OdometryMessage:
     """One odometry sample."""
 
-    stamp_ns: int  # sensor time
+    stamp_ns: int  # sensor time, nanoseconds
     T_odom_body: Pose  # (4, 4) odometry <- body, metres, gravity aligned
 
 
@@ -118,7 +118,7 @@ class PoseMessage:
     @property
     def stamp(self) -> float:
         """Sensor time of the pose, seconds, to a microsecond; :attr:`stamp_ns` is exact."""
-        return int(self.stamp_ns) / 1_000_000_000  # integer division: correctly rounded
+        return int(self.stamp_ns) / 1_000_000_000  # a quotient of two integers is correctly rounded
 
     @property
     def position(self) -> Floats:
@@ -169,7 +169,7 @@ class HypothesesMessage:
     posterior probability, log-likelihood ratio against chance.
     """
 
-    stamp_ns: int  # sensor time of the keyframe
+    stamp_ns: int  # sensor time of the keyframe, nanoseconds
     robot: str
     places: Floats
     none: float  # probability that the robot is nowhere on the map
@@ -181,7 +181,7 @@ class HypothesesMessage:
 class LocationMessage:
     """A robot's location on Earth (WGS 84)."""
 
-    stamp_ns: int  # sensor time
+    stamp_ns: int  # sensor time, nanoseconds
     robot: str
     latitude: float  # degrees, north positive
     longitude: float  # degrees, east positive

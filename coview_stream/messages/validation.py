@@ -20,7 +20,7 @@ MAX_PAYLOAD = 64 * 2**20
 MAX_POINTS = 4_000_000
 """Largest cloud that is decoded, points."""
 
-_NANO = 1_000_000_000
+_NANO = 1_000_000_000  # nanoseconds in a second
 
 
 class RefusedError(MessageError):

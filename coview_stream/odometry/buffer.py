@@ -22,9 +22,9 @@ _MIN_RESTART_SAMPLES = 5  # successive samples before a clock counts as restarte
 _SLACK = 0.5  # metres: corrections by a lidar odometry, rough stamps
 _SLACK_SPEED = 3.0  # metres per second, gain of speed that any robot may have
 _SPEED_FACTOR = 3.0  # factor on the speed of the last seconds
-_SPEED_WINDOW_NS = 2 * _NS
+_SPEED_WINDOW_NS = 2 * _NS  # of these last seconds
 _MIN_SPEED_SPAN = 0.2  # seconds of samples that give a speed
-_JUMP_ANGLE = np.radians(20.0)
+_JUMP_ANGLE = np.radians(20.0)  # turn that is plausible in any time
 _MAX_TURN_RATE = 20.0  # radians per second; a faster turn of more than _JUMP_ANGLE is a jump
 _UNREACHABLE = 10.0  # seconds of outage that a lost connection explains
 
@@ -46,7 +46,7 @@ class SampleKind(StrEnum):
 
 
 class _Entry(NamedTuple):
-    """A sample, with metres driven and radians turned since the first sample."""
+    """A sample, with the buffer's metres driven and radians turned at it."""
 
     stamp_ns: int
     T_odom_body: Pose
@@ -67,8 +67,8 @@ class OdometryBuffer:
     Attributes:
         newest: the newest sample, None before the first.
         arrived: local time (seconds) of its arrival.
-        travelled: metres driven since the first sample.
-        turned: radians turned since the first sample.
+        travelled: metres driven since the first sample, or the last jump, restart or outage.
+        turned: radians turned since then.
     """
 
     def __init__(self, config: NodeConfig) -> None:

@@ -16,7 +16,7 @@ _INSTANT = 1e-4  # seconds; smaller time differences are ignored
 
 @dataclass(frozen=True)
 class SweepCorrection:
-    """Calibration of sensor and odometry, for deskewing a sweep."""
+    """Calibration of sensor and odometry by which :func:`deskew` corrects the motion within a sweep."""
 
     R_body_cloud: Floats  # (3, 3) rotation that levels clouds of a leaning sensor
     scale: float = 0.0  # correction factor of odometry's distances, minus one
@@ -34,7 +34,7 @@ def deskew(
 
     Args:
         points: (N, 3) float32, each in the body frame at its own time, metres.
-        times: (N,) seconds after ``stamp_ns`` (negative before). Times outside the segment take its nearest end.
+        times: (N,) seconds after ``stamp_ns`` (negative before), NaN for 0; outside the segment its nearest end counts.
         segment: odometry that covers the sweep; with fewer than two samples nothing moves.
         stamp_ns: the frame's stamp.
         T_odom_body: (4, 4) odometry at that stamp.

@@ -112,7 +112,7 @@ def gravity_from_walls(points: Reals, up: Floats) -> tuple[Floats, int]:
 
 
 def wall_evidence(points: Reals, up: Floats, sigma: float) -> tuple[Floats, Floats, int]:
-    """Return ``up`` corrected by walls, their information matrix (3, 3), 1 / radians^2, and their number of patches."""
+    """Return ``up``, of ``sigma`` radians, corrected by walls, their information (3, 3), 1 / rad^2, and number."""
     normals = _patches(points[:: 1 + len(points) // _WALL_POINTS].astype(np.float64), up)
     better, walls = up, np.zeros((3, 3))
     for _ in range(_WALL_ROUNDS):
@@ -186,7 +186,7 @@ def _sums(values: Floats, cell_of: Indices, count: int) -> Floats:
 class Plumb:
     """The vertical by the surrounding surfaces, in level axes, for a filter."""
 
-    walls: Floats | None  # (2,) x and y of the unit vector along the walls; None without walls
+    walls: Floats | None  # (2,) x and y of the vertical by the walls, a unit vector; None without walls
     covariance: Floats  # (2, 2) of ``walls``, radians squared, up to a factor
     ground: Floats | None  # (2,) x and y of the ground's unit normal; None without ground
 
@@ -200,7 +200,7 @@ class Plumb:
 class Surfaces:
     """Walls and ground around one frame, in its body frame."""
 
-    walls: Floats | None  # (3,) unit vector along the walls; None without walls
+    walls: Floats | None  # (3,) vertical by the walls, a unit vector; None without walls
     information: Floats  # (3, 3) of ``walls``, 1 / radians squared
     ground: Ground | None  # None without ground
 

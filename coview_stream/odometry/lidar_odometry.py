@@ -93,14 +93,14 @@ _SHAKE_SECONDS = 0.1  # between these frames; a random walk over longer times
 class LidarOdometry:
     """Poses of a lidar's body frame in a gravity-aligned odometry frame, from its frames alone.
 
-    The odometry frame has z up; its origin and the level direction of its x are the body's at the first usable frame.
+    The odometry frame has z up; its origin and the heading of its x axis are the body's at the first usable frame.
     It drifts, but not in tilt where there are walls (:mod:`~coview_stream.odometry.tilt_filter`). The last motion,
     scaled to the time between stamps, predicts the next one and deskews the frame. ``docs/results.md`` has the costs;
     kiss-icp holds the interpreter lock.
 
     Attributes:
         config: the settings.
-        ground: the plane behind gravity's direction; None before the first frame, and with given gravity.
+        ground: the plane that gave gravity's direction; None before the first frame, and with given gravity.
         points: (N, 3) float32, the finite points of the newest frame, deskewed: input of a ``Localizer``.
         restarts: number of restarts of the local map, after gaps or impossible motions; odometry lacks the motion then.
     """
@@ -135,7 +135,7 @@ class LidarOdometry:
         Args:
             points: (N, 3) body frame (x forward, z up), metres; rows with NaN are dropped.
             point_times: (N,) seconds of the points after ``stamp`` (negative before); None for a deskewed frame. Equal
-                times deskew nothing; a point whose time is not finite stays.
+                times deskew nothing; a point whose time is NaN stays.
             stamp: seconds, later than the stamp of the previous frame.
 
         Returns:

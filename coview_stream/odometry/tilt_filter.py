@@ -6,7 +6,7 @@ two numbers each (radians):
 
     d_k = d_{k-1} + drift          of the local map; drift ~ N(0, 0.2^2 N)
     n_k ~ N(0, N)                  of this frame in the local map: registration's error, forgotten with the frame
-    b_k = phi b_{k-1} + ...        of the walls, the same for the next metres: phi = exp(-metres / 10), variance W
+    b_k = phi b_{k-1} + ...        of the walls: phi = exp(-metres / 10), variance min(kappa tr(C_k) / 2, (2 deg)^2)
     w_k ~ N(0, kappa C_k)          of the walls, different in each frame; C_k by their number and directions
     s_k = psi s_{k-1} + v_k        slope of the ground; v_k ~ N(0, Q), and psi^2 = 1 - Q / (4 deg)^2 keeps it near level
     m_k ~ N(0, M)                  true motion of the body since the last frame: 2 degrees in 0.1 s, no heavy tail
@@ -93,7 +93,7 @@ class _Variance:
 
 
 class TiltFilter:
-    """The filter of the module's docstring."""
+    """Kalman filter over the tilt of the local map, the walls' error and the ground's slope (see the module)."""
 
     def __init__(self, sigma: float) -> None:
         """Start with an up direction of ``sigma`` radians."""

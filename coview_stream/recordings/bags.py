@@ -73,7 +73,7 @@ class Track:
         return interpolate(self.poses[before], self.poses[after], share), known
 
     def around(self, begin_ns: int, end_ns: int, stamp_ns: int) -> Segment:
-        """Return the samples from the last before ``begin_ns`` to the first after ``end_ns``.
+        """Return the samples from the last at or before ``begin_ns`` to the first at or after ``end_ns``.
 
         Samples beyond a gap or jump, seen from ``stamp_ns``, are left out.
         """
@@ -108,7 +108,7 @@ def open_bag(
     Args:
         path: as returned by :func:`~coview_stream.recordings.layouts.find_bag`.
         explicit: TUM file with the odometry, at any stamps; None: the recording's.
-        cloud_topic: required if several topics have PointCloud2.
+        cloud_topic: required if several topics have PointCloud2, or several Livox clouds and none PointCloud2.
         odometry_topic: required if several topics have Odometry; ``/tf`` takes the odometry from there.
         from_clouds: computes the odometry, even if the recording has some.
         mount: pose of the lidar; clouds are read into the body frame. None: from ``/tf_static``.
@@ -148,7 +148,11 @@ def open_bag(
 
 
 class BagClouds:
-    """Clouds of a recording by index; reading in order takes one pass, otherwise each is found by its arrival."""
+    """Clouds of a recording by index; reading in order takes one pass, otherwise each is found by its arrival.
+
+    ``stamps`` and ``arrivals`` (K,) are nanoseconds, the latter of the recorder's clock; ``poses`` (K, 4, 4) are
+    odometry <- body at the stamps.
+    """
 
     def __init__(
         self,
@@ -301,15 +305,15 @@ def _take_odometry(path: Path, counts: dict[_Topic, int], survey: _Survey) -> No
 
 @dataclass(frozen=True)
 class _Mounted:
-    """How clouds get into the body frame."""
+    """Transformation of clouds into the body frame."""
 
     mount: Mount
-    registered: bool = False  # already in odometry's frame
+    registered: bool = False  # clouds are in odometry's frame; the inverse of its pose takes them into the body frame
     notes: tuple[str, ...] = ()
 
 
 def _mounted(path: Path, survey: _Survey, given: Mount | None, explicit: Path | None = None) -> _Mounted:
-    """Return how clouds get into the body frame: as ``given``, else from the recording's frames.
+    """Return the clouds' transformation into the body frame: as ``given``, else from the recording's frames.
 
     Odometry from the file ``explicit`` may be of any frame: a mount in the recording is then noted, not applied.
     """

@@ -33,7 +33,7 @@ _MAX_SKEW = 1e-3  # of a rotation matrix in text
 
 
 def is_kitti_raw(path: Path) -> bool:
-    """Whether a directory is a drive of KITTI's raw data."""
+    """Return whether a directory is a drive of KITTI's raw data."""
     return (path / _KITTI_SWEEPS / "data").is_dir()
 
 

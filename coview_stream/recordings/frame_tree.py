@@ -17,7 +17,7 @@ _BODIES = ("base_link", "base_footprint", "base_frame", "body")
 """Usual names of the body; the first that a tree has counts."""
 _WORLDS = ("map", "world", "earth", "utm", "global")
 """Frames above odometry's frame."""
-_SAME = 1e-6  # difference below which a transform is repeated
+_SAME = 1e-6  # greatest difference between elements of transforms that count as equal
 _MAX_FRAMES = 1000  # a hostile recording could name millions
 
 
@@ -33,7 +33,7 @@ def read_transforms(payload: bytes) -> Iterator[tuple[int, str, str, Pose]]:
 
 
 class FrameTree:
-    """Tree of a recording's frames; ``lidar`` is the clouds' frame: samples are kept where they may lie above it."""
+    """Tree of a recording's frames. ``lidar`` is the clouds' frame; samples are kept of frames that may be above it."""
 
     def __init__(self) -> None:
         self.lidar = ""
@@ -79,7 +79,8 @@ class FrameTree:
     def odometry(self) -> tuple[str, str, list[tuple[int, Pose]]] | None:
         """Return odometry's frame, the body's, and stamps (ns) with T_odom_body (4, 4); None without odometry.
 
-        The highest transform above the lidar counts that moves or starts at ``odom``; a map's if there is no other.
+        It is the highest transform above the lidar that moves, or whose parent's name has ``odom``, and whose parent is
+        no map or world; without such a one, the lowest that starts at a map or world.
         """
         moving = [
             child for child in self.above(self.lidar)[:-1]

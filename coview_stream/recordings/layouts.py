@@ -81,7 +81,7 @@ def find_layout(path: Path) -> Layout:
 
 
 def is_run(path: Path) -> bool:
-    """Whether a path is a recording, or a directory with a run's frames."""
+    """Return whether a path is a recording, or a directory with a run's frames (but not MulRan's)."""
     return find_bag(path) is not None or any((path / folder).is_dir() for folder in _FOLDERS)
 
 

@@ -37,7 +37,7 @@ def open_lidar_run(
     apart. Frames that odometry cannot place are left out and counted in the notes.
 
     Raises:
-        RunError: no frames, or odometry could place none. DependencyError: kiss-icp is missing.
+        RunError: no frames, a MulRan folder, or odometry could place none. DependencyError: kiss-icp is missing.
     """
     if odometry_topic is not None:
         raise RunError(f"{path}: --odometry kiss-icp and --odometry-topic {odometry_topic}; give one of them")
@@ -119,7 +119,7 @@ def open_bare_run(path: Path, cloud_topic: str | None = None, mount: Mount | Non
     recordings are not deskewed.
 
     Raises:
-        RunError: no frames, or stamps that do not match.
+        RunError: no frames, a MulRan folder, or stamps that do not match.
     """
     if (bag := find_bag(path)) is not None:
         return open_bag(bag, None, cloud_topic, None, lambda clouds: Track(clouds.stamps, clouds.poses), mount)

@@ -35,10 +35,10 @@ def open_run(
     Layouts: ``frames/NNNNNN.{pcd,ply,bin,npy,las,laz}`` with ``odometry.tum``; KITTI (``velodyne/*.bin``,
     ``times.txt``, ``poses.txt``, and ``calib.txt`` if the poses are the camera's); SC-LIO-SAM (``Scans/*.pcd``,
     ``times.txt``, ``odom_poses.txt``); MulRan (``sensor_data/Ouster/*.bin``, ``global_pose.csv``); a drive of KITTI's
-    raw data (``velodyne_points/``, ``oxts/``); and recordings with PointCloud2 and Odometry (rosbag2 directory,
-    ``.mcap``, ``.db3``, ROS 1 ``.bag``): odometry is interpolated at the clouds' header stamps, and deskews clouds
-    whose points have times. One cloud file, or one frame without odometry, is a run of one frame with stamp 0 and the
-    identity.
+    raw data (``velodyne_points/``, ``oxts/``); and recordings with PointCloud2 or Livox clouds, and Odometry or /tf
+    (rosbag2 directory, ``.mcap``, ``.db3``, ROS 1 ``.bag``): odometry is interpolated at the clouds' header stamps, and
+    deskews clouds whose points have times. One cloud file, or one frame without odometry, is a run of one frame with
+    stamp 0 and the identity.
 
     Args:
         path: directory, cloud file or recording.

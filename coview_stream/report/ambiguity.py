@@ -23,7 +23,7 @@ from coview_stream.report.plots import (
 )
 
 _LIMITS = {0.0: "#0072B2", 5.0: "#56B4E9", 10.0: "#009E73", 20.0: "#F0E442", 40.0: "#E69F00", math.inf: "#D55E00"}
-"""Colours (Okabe and Ito) of the stations that a robot can tell apart after so many metres."""
+"""Colours (Okabe and Ito) of the stations from which a robot has to drive at most so many metres until found."""
 
 _AREA = 50.0  # metres: stations within this distance form one part of the site
 
@@ -75,8 +75,7 @@ def facts(result: Ambiguity, base_map: BaseMap) -> dict[str, Any]:
 def plot_ambiguity(result: Ambiguity, base_map: BaseMap, path: str | os.PathLike[str], title: str) -> None:
     """Draw the map in grey, and its stations coloured by the distance that a robot has to drive from them.
 
-    Raises:
-        InputError: the picture cannot be written.
+    InputError if the picture cannot be written.
     """
     release_arrays(base_map.arrays)  # memory of the search
     base = base_map.sampled_points(MAX_BASE_POINTS) + base_map.origin

@@ -102,8 +102,7 @@ class Evaluation:
 def frame_errors(estimate: Trajectory, truth: Trajectory) -> FrameErrors:
     """Return the errors of each estimated pose against the true pose with the nearest stamp.
 
-    Raises:
-        InputError: the truth holds no pose.
+    InputError if the truth holds no pose.
     """
     if not len(truth[0]):
         raise InputError("truth: holds no pose; give the trajectory that was really driven")

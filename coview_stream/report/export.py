@@ -32,7 +32,7 @@ class Trajectory:
     poses: Poses
     """(N, 4, 4) map <- body, metres."""
     geodetic: Floats | None = None
-    """(N, 3) latitude, longitude and height; None if the map has no reference system."""
+    """(N, 3) latitude, longitude (degrees) and height (metres); None if the map has no reference system."""
     kinds: Sequence[str] | None = None
     """(N,) kinds of the poses; None unless they are smoothed."""
 
@@ -125,7 +125,7 @@ def reference_for(crs: str | None, names: Sequence[str]) -> GeoReference | None:
 
 
 def export(trajectory: Trajectory, folder: Path, names: Sequence[str]) -> list[Path]:
-    """Write a trajectory into an existing folder, one file per format; return the files."""
+    """Write a trajectory into an existing folder, a file per format, and return the files; OSError if that fails."""
     written = []
     for name in names:
         file, write = FORMATS[name]

@@ -56,10 +56,8 @@ _STYLE = {
 def figure(path: str | os.PathLike[str], **options: Any) -> Iterator[tuple[Any, Any]]:
     """Yield a figure and its axes, and save the figure as ``path`` when the block ends.
 
-    The Agg canvas is used directly: neither the caller's backend nor pyplot's state is touched.
-
-    Raises:
-        InputError: the picture cannot be written.
+    The Agg canvas is used directly: neither the caller's backend nor pyplot's state is touched. InputError if the
+    picture cannot be written.
     """
     with naming_missing_libraries("pictures"):
         import matplotlib as mpl
@@ -90,7 +88,6 @@ def draw_base_map(axes: Any, points: Reals) -> Floats:
     if len(points):
         sample = np.asarray(points[:: max(1, -(-len(points) // MAX_BASE_POINTS))], dtype=np.float64) - shift
         grey, extent = _shaded(sample)
-        # one colour for holes
         axes.imshow(grey.T, cmap="gray", vmin=0, vmax=1, origin="lower", extent=extent, interpolation="nearest")
     axes.set_aspect("equal", adjustable="datalim")
     axes.set_xlabel(_axis_label("east", shift[0]))
@@ -254,8 +251,7 @@ def _draw_places(axes: Any, places: Floats, shift: Floats) -> None:
 def plot_errors(distance: Reals, e_t: Reals, e_r: Reals, path: str | os.PathLike[str]) -> None:
     """Draw translation errors (N,) in metres and rotation errors (N,) in radians over (N,) metres driven.
 
-    Raises:
-        InputError: the picture cannot be written.
+    InputError if the picture cannot be written.
     """
     wrong = (e_t >= MAX_TRANSLATION) | (e_r >= MAX_ROTATION)
     rows = (
@@ -304,10 +300,7 @@ def plot_descriptor_pair(
 
     Rings run outwards, sectors counter-clockwise from the right. The winner is turned by ``shift`` sectors so that
     equal places look equal: ``np.roll(winner, shift, axis=1)`` puts its column ``j - shift`` on column ``j`` of the
-    query. NaN is empty.
-
-    Raises:
-        InputError: the descriptors differ in shape, or the picture cannot be written.
+    query. NaN is empty. InputError if the descriptors differ in shape, or the picture cannot be written.
     """
     if query.shape != winner.shape or query.ndim != 2:
         raise InputError(f"descriptors: shapes {query.shape} and {winner.shape} differ; give two (rings, sectors)")
@@ -334,10 +327,7 @@ def plot_descriptor_pair(
 def draw_run(result: RunResult, base_map: BaseMap, folder: Path, truth: Reals | None = None) -> None:
     """Draw ``trajectory.png`` and, after a fix, ``descriptors.png`` into an existing folder.
 
-    ``truth`` has true positions (T, 3) in the map frame, metres.
-
-    Raises:
-        InputError: a picture cannot be written.
+    ``truth`` has true positions (T, 3) in the map frame, metres. InputError if a picture cannot be written.
     """
     no_position = np.full(3, np.nan)
     smoothed = {pose.stamp: pose for pose in result.smoothed or ()}

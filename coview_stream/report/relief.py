@@ -19,7 +19,7 @@ from coview_stream.geometry.rasters import cells, filled, max_filter
 from coview_stream.report.plots import base_shift, draw_notice, figure, map_figure_size
 
 _PIXELS = 1200  # along the picture's longer side
-_MAX_POINTS, _SAMPLED = 4_000_000, 100_000
+_MAX_POINTS, _SAMPLED = 4_000_000, 100_000  # points that are shaded, and that set the size of the figure
 _TALL = 2.0  # metres above the ground: roofs and crowns, not cars and hedges
 _PLANE = 0.75  # least planarity of the points on a roof; dense crowns have less
 _SMOOTH = 0.6  # slope of a square against the mean of the tall squares around; roofs have less, crowns more
@@ -111,8 +111,7 @@ def _shade(heights: Floats, cell: float) -> Floats:
 def plot_map(base_map: BaseMap, path: str | os.PathLike[str], title: str = "Base map") -> None:
     """Draw a map from above with scale, north and, if sparse enough, its stations; ``.tif`` writes a GeoTIFF.
 
-    Raises:
-        InputError: the picture cannot be written.
+    InputError if the picture cannot be written.
     """
     seen = relief(base_map)
     if Path(path).suffix.lower() in (".tif", ".tiff"):
@@ -168,9 +167,7 @@ def write_geotiff(seen: Relief, path: str | os.PathLike[str], crs: str | None) -
     """Write a relief as a deflated GeoTIFF of 8-bit RGBA, for GIS programs.
 
     Unless the reference system has an EPSG number, the file states its position but not its system.
-
-    Raises:
-        InputError: the file cannot be written.
+    InputError if the file cannot be written.
     """
     from PIL import Image, TiffImagePlugin, TiffTags
 

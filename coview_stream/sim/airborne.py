@@ -181,7 +181,7 @@ def airborne_survey(points: Reals, survey: Survey = _DEFAULT) -> Floats:
 
 
 def surface_of(points: Floats) -> Surface:
-    """Find walls and foliage by the spread of the neighbours of each point (N, 3)."""
+    """Find walls and foliage by the spread of the neighbours of each point (N, 3); InputError for too few points."""
     grid = np.asarray(voxel_grid(points.astype(np.float32), _GRID), dtype=np.float64)
     if len(grid) < _NEIGHBOURS:
         raise InputError(f"a survey of {len(grid)} places {_GRID} m apart; give one of {_NEIGHBOURS} or more")

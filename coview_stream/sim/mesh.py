@@ -28,7 +28,7 @@ _BOX = np.array(
         [[2, 3, 7], [2, 7, 6], [3, 0, 4], [3, 4, 7]],
         [[4, 5, 6], [4, 6, 7], [0, 2, 1], [0, 3, 2]],
     ]
-).reshape(-1, 3)
+).reshape(-1, 3)  # triangles of a prism, outward; corners 0 to 3 are the bottom's, 4 to 7 the top's
 
 
 def join(meshes: Iterable[Mesh]) -> Mesh:

@@ -47,10 +47,10 @@ class OdometryConfig:
 def drive(
     scene: Scene, length: float, speed: float, height: float, rng: np.random.Generator, period: float = FRAME_PERIOD
 ) -> Floats:
-    """Return poses (N, 4, 4) of the sensor in the scene, one every ``period`` seconds over ``length`` metres.
+    """Return poses ``T_scene_body`` (N, 4, 4), one every ``period`` seconds over ``length`` metres at ``speed``, m/s.
 
-    Start and direction on the route are drawn; a long drive repeats the loop. The sensor is ``height`` metres above
-    the ground, and pitches and rolls with it.
+    Start and direction on the route are drawn; a long drive repeats the loop. The body's origin is ``height`` metres
+    above the ground, with which the body pitches and rolls.
     """
     route = scene.route if rng.random() < 0.5 else scene.route[::-1]
     arc = arc_lengths(route)

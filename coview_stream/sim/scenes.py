@@ -1,7 +1,7 @@
 """Seeded scenes in two states: when the map was made, and now.
 
 The scene frame has z up, metres, and its origin at the centre. Trees, cars and poles may change between the states;
-ground, buildings and hedges stay.
+ground, buildings and hedges stay, except in :func:`coview_stream.sim.dirt.scene.aged`.
 """
 
 from __future__ import annotations

@@ -35,7 +35,7 @@ class Hits(NamedTuple):
     distance: Floats32  # (N,) metres; inf without a hit
     incidence: Floats32  # (N,) absolute cosine of the angle of incidence; 1 on foliage
     mesh: Indices  # (N,) index of the mesh; -1 without a hit
-    normal: Floats32  # (N, 3) unit normals of the surfaces, of either sign
+    normal: Floats32  # (N, 3) unit normals of the surfaces, of either sign; zeros without a hit
 
 
 class MeshCaster:
@@ -134,7 +134,10 @@ class Sensor:
         porosity: float = POROSITY,
         noise: float = RANGE_NOISE,
     ) -> Points:
-        """Return one deskewed frame (N, 3) in the sensor frame, float32 metres, with range ``noise``."""
+        """Return one deskewed frame (N, 3) in the sensor frame, float32 metres, with range ``noise`` (one sigma).
+
+        ``T_scene_body`` is the pose (4, 4) of the sensor: with a mount, ``T_scene_body @ T_body_sensor``.
+        """
         rays = self.beams(frame)
         origins = np.broadcast_to(T_scene_body[:3, 3].astype(np.float32), rays.shape)
         turned = (rays @ T_scene_body[:3, :3].T).astype(np.float32)

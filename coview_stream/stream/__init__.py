@@ -1,1 +1,1 @@
-"""Frames arrive over zenoh, poses in the map frame leave. Only this package has threads, clocks and processes."""
+"""The live side: nodes and clients exchange lidar frames, odometry and poses over zenoh or ROS 2."""

@@ -45,10 +45,10 @@ from coview_stream.stream.node.engine_queue import (
 from coview_stream.stream.node.inputs import PairedFrame
 from coview_stream.stream.transport.error_guard import RateLimitedErrors
 
-_NAME = "the robot"
+_NAME = "the robot"  # in log lines
 _MAX_UNSEEN = 5.0  # seconds on odometry alone, as NodeConfig.dead_reckoning_timeout
 _STEP = 0.05  # seconds between checks of engines that are not ready
-_CLOSE_TIMEOUT = 1.0  # seconds for the threads to end
+_CLOSE_TIMEOUT = 1.0  # seconds for the threads to end, all together
 
 log = logging.getLogger("coview_stream")
 
@@ -93,7 +93,7 @@ class AsyncLocalizer(SavedState):
         self._end = weakref.finalize(self, _end, self._feed, self._pid)
 
     def prepare(self, timeout: float | None = None) -> None:
-        """Wait until the processes have opened the map and compiled their kernels, a minute on the first run.
+        """Wait until the processes have opened the map; on a machine's first run they also compile their kernels.
 
         Raises:
             CoViewError: a process failed; the text says why. TimeoutError: not ready after ``timeout`` seconds.
@@ -235,9 +235,9 @@ class _Frame(NamedTuple):
 
 
 class Mailbox:
-    """The agent's frames on their way to the engines, and the newest fix on its way back, behind one lock.
+    """The caller's frames on their way to the engines, and the newest fix on its way back, behind one lock.
 
-    The engine feed treats it as a robot. Pure logic: no thread or process; the clock serves statistics only.
+    The engine feed handles it as it does a node's robot. It has no thread or process; its clock serves statistics only.
     """
 
     def __init__(self) -> None:
@@ -247,10 +247,10 @@ class Mailbox:
         self.changed = threading.Condition()
         self._epoch = 0
         self._error: str | None = None  # not raised yet
-        self._search_told = False  # whether the restart of its engine has told of the running search's failure
+        self._search_told = False  # whether the search engine's restart has reported the running search as failed
         self.begin(keep_calibration=False)
 
-    # ---- the agent's side
+    # ---- called by AsyncLocalizer
 
     def begin(self, keep_calibration: bool) -> None:
         """Start a new epoch without a place."""
@@ -273,7 +273,7 @@ class Mailbox:
         self._frames: dict[int, _Frame] = {}  # by stamp in nanoseconds, from the frame being processed on
 
     def add_frame(self, cloud: Reals, T_odom_body: Pose, stamp: float) -> None:
-        """Check a frame and queue it for the engine."""
+        """Check a frame and queue it for the engine; a jump of odometry starts another epoch. Errors as in ``step``."""
         points = validate_cloud(cloud)
         with self.changed:
             last = self._newest
@@ -349,7 +349,7 @@ class Mailbox:
             return Fix(newest.stamp, state, evidence=KeyframeEvidence(at.stamp, state, reason), calibration=calibration)
         return replace(fix, stamp=newest.stamp)
 
-    # ---- the feed's side
+    # ---- called by the engine feed
 
     def has_job(self, engine: str) -> bool:
         """Whether ``track`` has a frame or a search result to process, or ``search`` a keyframe."""
@@ -395,7 +395,7 @@ class Mailbox:
             self.queue.note_doubt(job)
 
     def handle_failure(self, job: Job, reason: str, rejected: bool = False) -> None:
-        """Restart the search if the tracking engine has forgotten the robot; report the failure to the agent."""
+        """Keep the failure for the caller; restart the search if the tracking engine has forgotten the robot."""
         with self.changed:
             if isinstance(job, FrameJob):
                 if self.queue.frame_failed(job, reason, rejected):
@@ -407,14 +407,14 @@ class Mailbox:
             self.changed.notify_all()
 
     def engine_restarted(self, engine: str = "track", why: str = "it died") -> None:
-        """Restart the search if the tracking engine was restarted; report it to the agent."""
+        """Keep the restart for the caller; restart the search too if it was the tracking engine."""
         with self.changed:
             self._fail(f"{why}; it is started again", searches=engine == "track")
             self._search_told = self._search_told or engine == "search"
             self.changed.notify_all()
 
     def _fail(self, error: str, searches: bool) -> None:
-        """Keep an error; if the place is forgotten, start another epoch with the last place as a hint."""
+        """Keep an error; if the engine ``searches`` anew, start another epoch with the last place as a hint."""
         self._error = self._error or error  # the first since the last call
         if not searches:
             return

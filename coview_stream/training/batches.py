@@ -65,7 +65,7 @@ PIECE = 272
 
 _REACH = 36.0  # metres from a piece's centre within which queries lie, so that their 30 m are on the piece
 _ROTATED = 0.5  # share of the pieces that are rotated by any angle, not only by quarter turns
-_NARROWED = 0.4  # share of the queries that are cut at a random radius
+_NARROWED = 0.4  # share of the queries that are cut at a random radius, 12 to 30 m
 _SECTOR_LOST = 0.25  # share of the queries that lose a sector
 _FROM_MAP = 0.1  # share of the queries cut from the map: driving all around a tree shows its whole crown too
 _RADIUS = 30.0  # metres, of a query
@@ -79,7 +79,7 @@ class Batch:
     pieces: Image  # (G, LAYERS, PIECE, PIECE)
     queries: Image  # (Q, LAYERS, 128, 128)
     piece_of: Ints  # (Q,) index of each query's piece
-    poses: Floats  # (Q, 3) x, y and heading of the queries in the frame of their piece, from its centre
+    poses: Floats  # (Q, 3) x, y and heading of the queries in their piece's frame, from its centre; metres, radians
 
 
 def draw_batch(
@@ -125,7 +125,7 @@ def _middle(world: WorldViews, count: int, rng: np.random.Generator) -> tuple[Fl
 
 
 def _piece(world: WorldViews, centre: Floats, turn: float, mirrored: bool, size: int = PIECE) -> Image:
-    """Cut a piece around ``centre``: ``p_world = R(turn) p_piece + centre``."""
+    """Cut a piece around ``centre``: ``p_world = R(turn) p_piece + centre``, then negate the piece's y if mirrored."""
     at = (np.arange(size) + 0.5 - size / 2) * CELL
     x, y = np.meshgrid(at, -at if mirrored else at, indexing="xy")
     column = (np.cos(turn) * x - np.sin(turn) * y + centre[0] - world.corner[0]) / CELL

@@ -115,7 +115,7 @@ def scanned(
     sensor: str,
     porosity: float,
 ) -> Frames:
-    """Drive a path (N, 2) over the ``ground`` to its end, and scan."""
+    """Return the frames of a drive along a path (N, 2) over the ``ground`` to its end."""
     along, frames = _moments(rng, recipe, path, sensor)
     heading = directions(path) if len(path) > 2 else np.full(len(path), rng.uniform(0, 2 * np.pi))
     T = _poses(rng, recipe, path[along], heading[along], ground)

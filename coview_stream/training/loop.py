@@ -25,7 +25,7 @@ _FINAL_RATE = 0.01  # share of the learning rate at the end
 _MAX_GRADIENT = 5.0  # norm
 _CHECKPOINT_STEPS = 100  # between checkpoints
 
-Report = Callable[[int, Losses], None]
+Report = Callable[[int, Losses], None]  # called after each step with its number, from 0, and its losses
 
 
 def train(

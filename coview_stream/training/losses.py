@@ -11,7 +11,7 @@ from torch.nn import functional
 from coview_stream.descriptors.network import LOCAL_CELL, PLACE_CELL
 
 _COARSE = 2  # local cells per coarse cell: the dense search runs on cells of 2 m
-_RADIUS = 29.0  # metres around a query's centre within which cells count
+_RADIUS = 29.0  # metres around a query's centre within which cells count, as in train.py
 _DENSE_SCALE = 20.0  # on scores in [-1, 1] before the softmax of the dense search
 _LOCAL_TEMPERATURE = 0.07  # of the softmax over local descriptors
 _PLACE_TEMPERATURE = 0.08  # of the softmax over global descriptors

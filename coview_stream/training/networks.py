@@ -166,7 +166,7 @@ def _folded(module: Any, view: int) -> tuple[Floats32, Floats32]:
 
 
 def encoder(net: PlaceNet, view: str) -> Callable[[Image], Features]:
-    """Give a network in training the interface of the exported :class:`~.descriptors.network.Network`."""
+    """Return the encoder of a view, with the interface of :class:`~coview_stream.descriptors.network.Network`."""
 
     def encode(image: Image) -> Features:
         with torch.no_grad():

@@ -41,7 +41,7 @@ def draw_stand(rng: np.random.Generator, recipe: Recipe, half: float) -> Stand:
     species = draw_species(rng, recipe)
     trees = draw_trees(rng, recipe, terrain, xy, species)
     first, second = (bool(winter) for winter in rng.random(2) < recipe.leaf_off)
-    winters = (first, first if rng.random() < 0.5 else second)  # in half of the cases both times are in the same season
+    winters = (first, first if rng.random() < 0.5 else second)  # in half or more of the cases both are in one season
     mortality, wind = recipe.draw(rng, "mortality"), recipe.draw(rng, "wind")
     understory = recipe.draw(rng, "understory") * float(rng.random() < 0.8)
     leaves = tree_meshes.crowns(rng, trees)

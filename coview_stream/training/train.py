@@ -148,7 +148,7 @@ def train_session(
 
 
 def evaluate(worlds: Sequence[WorldViews], aerial: Any, ground: Any, max_queries: int) -> dict[str, Any]:
-    """Return the share of queries found, in total and by sensor, and the share by chance."""
+    """Return the shares of queries found first (AR@1, also by sensor) and among five (AR@5), and that by chance."""
     results = search_queries(worlds, aerial, ground, max_queries)
     area = float(np.mean([world.aerial[0].size * 0.25 for world in worlds]))
     result: dict[str, Any] = {
@@ -179,7 +179,7 @@ _CELL = 2.0  # metres of the dense search
 _BEST = 5  # places kept
 _DISTINCT = 10.0  # least metres between two places
 _MAX_ERROR = 10.0  # metres from the truth within which a place counts as found
-_RADIUS = 29.0  # metres around a query's centre within which cells are compared
+_RADIUS = 29.0  # metres around a query's centre within which cells are compared, as in the losses
 
 Encoder = Callable[[Image], Features]
 
@@ -204,7 +204,7 @@ class SearchedQuery:
 def search_queries(
     worlds: Sequence[WorldViews], aerial: Encoder, ground: Encoder, max_queries: int | None = None
 ) -> list[SearchedQuery]:
-    """Search every query (at most ``max_queries`` per world) in its world's map, at all places and headings."""
+    """Search every query (at most ``max_queries`` per world) in its world's map, at all places and 36 headings."""
     yaws = np.arange(HEADINGS) * 2 * np.pi / HEADINGS
     results = []
     for number, world in enumerate(worlds):

@@ -104,7 +104,7 @@ def base_scan(world: World, seed: int, recipe: Recipe) -> tuple[Points, dict[str
 
 
 def drives(world: World, seed: int, recipe: Recipe) -> Iterator[tuple[str, Frames]]:
-    """Drive through the world ``recipe.submaps`` times; yield the sensor's name and its frames."""
+    """Drive through the world ``recipe.submaps`` times; yield the sensor's name and the drive's frames."""
     rng = np.random.default_rng([seed, _DRIVES])
     caster = Caster(world.now, threads=1, leaf_depth=recipe.draw(rng, "leaf_depth"))
     porosity = recipe.draw(rng, "ground_porosity")

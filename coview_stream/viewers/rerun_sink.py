@@ -25,7 +25,7 @@ _MAX_START = 10.0  # seconds for the viewer to listen
 _STRIP = 50  # poses per line strip: redrawing the whole path at each pose is quadratic
 _SIGMAS = 3.0  # of the covariance ellipsoid
 _AXES = ((220, 60, 60), (60, 180, 60), (70, 90, 230))  # x forward, y left, z up
-_GROUND, _STRUCTURE = (150, 150, 140), (90, 110, 140)
+_GROUND, _STRUCTURE = (150, 150, 140), (90, 110, 140)  # red, green, blue
 
 
 class RerunSink(Sink):
@@ -36,7 +36,7 @@ class RerunSink(Sink):
 
     Raises:
         DependencyError: rerun is not installed. ConfigError: there is no display, or the viewer does not start.
-        InputError: the file cannot be written.
+        InputError: the file's directory is missing.
     """
 
     def __init__(self, save: Path | None = None) -> None:
@@ -116,7 +116,7 @@ class RerunSink(Sink):
         return out
 
     def _zero(self, place: Floats) -> Floats:
-        """Return the map's origin, or the first place while the map is unknown."""
+        """Return the map's origin, or the first place, in whole metres, while the map is unknown."""
         if self._origin is None:
             self._origin = np.asarray(np.round(place), dtype=np.float64)
         return self._origin

@@ -17,7 +17,7 @@ from coview_stream.basemap.summary import MapView
 from coview_stream.geometry.transforms import Points, Pose, interpolate
 from coview_stream.messages.types import HypothesesMessage, PoseMessage
 
-_KEPT = 64  # poses of a robot, for its scans
+_KEPT = 64  # poses of a robot, six seconds at 10 Hz
 _TOLERANCE_NS = 150_000_000  # beyond the first or last pose, which is then used
 _MAX_GAP_NS = 2_000_000_000  # largest gap between two poses to interpolate
 
@@ -28,18 +28,18 @@ class Scan:
 
     robot: str
     stamp_ns: int
-    """Sensor time."""
+    """Sensor time, nanoseconds."""
     points: Points
     """(N, 3) body frame, metres; no NaN."""
     T_map_body: Pose | None
-    """At the stamp; None where no pose is known."""
+    """(4, 4) map <- body at the stamp, metres; None where no pose is known."""
 
 
 class Sink:
     """Receiver of a session's events; subclasses override the methods that they need.
 
-    All methods are called on the feed's thread and must return soon: events queue meanwhile, and a full queue drops the
-    oldest. Errors are logged.
+    All methods but ``close`` are called on the feed's thread and must return soon: events queue meanwhile, and a full
+    queue drops the oldest. Errors are logged.
     """
 
     def map(self, view: MapView) -> None:

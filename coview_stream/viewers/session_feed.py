@@ -31,7 +31,7 @@ from coview_stream.viewers.scene import PoseTrack, Scan, Sink
 _TIMEOUT = 10.0  # seconds for a query: at the first one the node thins its map
 
 MapSource = Callable[[str], MapView]
-"""Returns the map that serves a robot, or raises a CoViewError."""
+"""Takes a robot's name, and returns the map on which its node localizes it; a CoViewError if there is none."""
 
 
 def asked_of_node(transport: Transport, base: str) -> MapSource:
@@ -94,9 +94,9 @@ _log = logging.getLogger(__name__)
 MAX_ROBOTS = 256
 """Limit of robots in view: names come from the network."""
 _MAX_QUEUED = 4_000  # messages waiting for slow sinks
-_POLL = 0.05  # seconds
+_POLL = 0.05  # seconds without an event until clouds are looked at
 _SCAN_PERIOD = 0.2  # seconds between decoded scans of a robot
-_SCAN_POINTS = 6_000
+_SCAN_POINTS = 6_000  # points of a scan that sinks get
 _POSE_WAIT = 0.4  # seconds that a scan waits for a pose at its time
 _JOIN_TIMEOUT = 0.2  # seconds for a thread to end; the map's thread may be busy longer
 _MAP_RETRY = 5.0  # seconds between requests for a map
@@ -107,10 +107,11 @@ class SessionFeed:
 
     Args:
         transport: the caller closes it.
-        map_source: called with a robot's name when its status names an unknown map; None: no map.
+        map_view: map to show from the start; None: none.
+        map_source: called with a robot's name when its status names an unknown map; None: no further map.
         clouds: whether to subscribe to clouds, most of the traffic.
         mount: pose of the lidars on their robots, as in ``serve --mount``.
-        policy: ``newest`` if a full queue must not block the publisher, as in the node's own process.
+        policy: of the subscriptions except to clouds, which are ``newest``; ``newest`` in the node's own process.
     """
 
     def __init__(

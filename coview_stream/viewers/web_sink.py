@@ -126,9 +126,9 @@ _TRAIL = 4_000  # points of a robot's trail
 _TRAIL_STEP = 0.25  # metres between its points
 _TRAIL_GAP = 2.0  # seconds without a pose that interrupt the trail
 _MAX_TEXT = 500  # characters of a text from the network
-_MAX_TEXTS = 8
-_SCAN_POINTS = 3_000
-_SCAN_STEP = 0.01  # metres
+_MAX_TEXTS = 8  # of a list from the network
+_SCAN_POINTS = 3_000  # of a scan
+_SCAN_STEP = 0.01  # metres, unit of a scan's coordinates
 _MAPS = 4  # maps kept
 
 _STATUS = ("state", "reason", "version", "map_sha256", "odometry", "uptime_s", "stamp_ns")
@@ -264,7 +264,7 @@ def packed_map(view: MapView) -> bytes:
     """Return a map in the form that the page reads.
 
     The length of the header in four bytes, the header (JSON, padded to a multiple of four bytes), and the points x, y,
-    z as little-endian int16, in units of ``step`` metres from ``origin``, first the ``ground`` points of the ground.
+    z as little-endian int16, in units of ``step_m`` metres from ``origin``, first the ``ground`` points of the ground.
     """
     data = view.to_json()
     header = {name: data[name] for name in ("map_sha256", "crs", "origin", "step_m", "count", "ground")}

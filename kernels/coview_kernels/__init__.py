@@ -1,8 +1,8 @@
 """Numerical kernels of coview_stream: functions from arrays to arrays, without files, network or localization.
 
-Every function checks its arguments, then runs in Taichi on one owner thread, or in NumPy
-(:mod:`coview_kernels.reference`) if Taichi is missing or ``COVIEW_KERNELS=numpy`` is set; both agree. Any thread may
-call them. Importing this package does not import Taichi; the first call does.
+Every function checks its arguments, then runs in Taichi, one call at a time, or in NumPy
+(:mod:`coview_kernels.reference`) if Taichi is missing or ``COVIEW_KERNELS=numpy`` is set; both agree. A few always run
+in NumPy. Any thread may call them. Importing this package does not import Taichi; the first call does.
 """
 
 from __future__ import annotations

@@ -14,6 +14,7 @@ WHOLES = ti.types.ndarray(i32, 1)
 def distinct(
     poses: FLOATS, kept: FLOATS, chosen: WHOLES, found: WHOLES, size: i32, count: i32, square: f32, cosine: f32
 ):
+    """Write the indices of the chosen poses, and their number to ``found``; ``kept`` is working memory (5, count)."""
     ti.loop_config(serialize=True)
     for _ in range(1):
         n = 0

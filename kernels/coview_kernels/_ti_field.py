@@ -32,7 +32,7 @@ PLANES = ti.types.ndarray(ti.u16, 1)
 BITS = ti.types.ndarray(ti.i64, 1)
 
 WINDOW = 2 * REACH + 1  # coarse shifts along each axis
-# bits are indexed from the array's beginning, or on large maps from its middle: ``first`` is 0 or -2^31, and indices
+# bits are indexed from the array's beginning, or on large maps from word 2^31: ``first`` is 0 or -2^31, and indices
 # are added to it in 32 bits with wrap-around
 DIGITS = 7  # of a number of hits: 127 points at most
 CENTIMETRE = 0.01

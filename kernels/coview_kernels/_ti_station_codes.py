@@ -53,6 +53,7 @@ def _best(serial: bool):
 
     @runtime.kernel
     def best(codes: SHORTS, query: SHORTS, turn: SHORTS, found: WHOLES, length: i32):
+        """Write the greatest correlation of each station over the angles; ``length`` is LANES."""
         if ti.static(serial):
             ti.loop_config(serialize=True)
         for m in range(found.shape[0]):
@@ -115,6 +116,7 @@ def _best(serial: bool):
 
 @runtime.kernel
 def products(codes: SHORTS, query: FLOATS, stations: WHOLES, found: FLOATS, count: i32):
+    """Write the products of a query with ``count`` stations, by group, real and imaginary part, and lane."""
     ti.loop_config(serialize=True)
     for k in range(count):
         start = stations[k] * SIZE
@@ -135,6 +137,7 @@ def products(codes: SHORTS, query: FLOATS, stations: WHOLES, found: FLOATS, coun
 
 @runtime.kernel
 def at(codes: SHORTS, table: FLOATS, stations: WHOLES, shifts: WHOLES, found: FLOATS, count: i32):
+    """Write the correlations of ``count`` stations at their shifts; skips station -1."""
     ti.loop_config(serialize=True)
     for k in range(count):
         if stations[k] >= 0:

@@ -35,7 +35,7 @@ COARSE, FINE, LOW, LEVELS = 96, 160, 64, 2
 of 24 places was lost in one world; docs/results.md says how often the right place comes first."""
 
 _MAX_TABLE = 1 << 21  # tiles in a map's bounding rectangle, 537 km2: kernels count in int32
-_MIDDLE = 1 << 31  # words of bits that a signed 32-bit index reaches; on larger maps it counts from the middle
+_MIDDLE = 1 << 31  # words of bits that a signed 32-bit index reaches; on larger maps it counts from this word
 _BATCH = 512  # tiles at a time, to keep intermediate arrays small
 _BAND = 16  # rows of tiles at a time, for the same reason
 
@@ -50,9 +50,9 @@ class Move(Enum):
     HEIGHT = "height"
     """To the map's ground, along z alone."""
     NEAR = "near"
-    """By at most 0.4 m and 0.8 degrees, fine levels only."""
+    """By at most 0.375 m along x and y each and 0.75 degrees, fine levels only; and along z to the ground."""
     FAR = "far"
-    """By at most 3 m and 7 degrees."""
+    """By at most 3.75 m along x and y each and 7.5 degrees; and along z to the ground."""
 
 
 class FieldScores(NamedTuple):
@@ -61,7 +61,7 @@ class FieldScores(NamedTuple):
     pose: F64
     """(H, 4) x, y, z of the pivot in the map, metres, and heading of the scan's frame, radians."""
     structure: I32
-    """(H,) structure points on surveyed cells; the next two are subsets."""
+    """(H,) structure points on surveyed cells; ``near``, ``covered`` and ``on`` are subsets."""
     near: I32
     """(H,) within about half a metre of map structure."""
     covered: I32
@@ -309,7 +309,7 @@ def _fill_near(bits: I64, table: I32, done: Callable[[], object]) -> None:
 
 
 def _fill_coarse(planes: U16, bits: I64, table: I32, done: Callable[[], object]) -> None:
-    """Fill planes (32, W / 8, H) of one-metre cells (:class:`FieldLayers`), set within a metre of structure."""
+    """Fill the coarse planes of :class:`FieldLayers`: bits are set within a metre of structure."""
     half, (rows, columns) = TILE // 2, table.shape
     one, rest = np.uint32(1), np.uint32(31)
     for start in range(0, rows, _BAND):

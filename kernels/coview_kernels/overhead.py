@@ -31,7 +31,7 @@ def height_columns(
     """Sort the points (N, 3) into levels above the ground, cell by cell.
 
     Args:
-        points: metres.
+        points: (N, 3) float32, metres.
         grid: the cells.
         ground: (h, w) ground height in cells ``ratio`` times as large, metres; bilinear between their centres.
         ratio: cells of the grid along the edge of a ground cell.

@@ -107,8 +107,8 @@ def station_bins(
 
     Station m is at the centre of raster cell (rows[m], cols[m]) at height ground[m]; rows run along y, columns along x.
     A raster cell counts as ``raster_count`` points at its centre, so that one table from (dx, dy) to bin, with the
-    edges of :func:`polar_bin`, serves all stations. Outside the raster there is nothing. The result takes 12 R S bytes
-    per station: pass stations in portions.
+    edges of :func:`polar_bin`, serves all stations. Outside the raster there is nothing. The result takes 8 R S bytes
+    per station, 12 with means: pass stations in portions.
 
     Args:
         raster_max: (H, W) float32 greatest height of each cell, metres; ignored if the count is 0.

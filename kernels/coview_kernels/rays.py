@@ -1,4 +1,4 @@
-"""First hits of rays on triangles, by a tree of boxes that halves the triangles at every level.
+"""First hits of rays on triangles, by a tree of boxes: each level halves the triangles of a box.
 
 The nodes are numbered as in a heap: 1 is the root, 2 n and 2 n + 1 are the children of n, and all leaves, equally
 full, are on the last level. A ray needs no stack, because siblings and parents follow from the number.

@@ -5,7 +5,7 @@ system library except libc and starts in half the time (commit 731ba9db, bench/s
 
 Taichi starts at the first kernel, not at import, and belongs to one thread: a program must be initialised and first
 launched on the same thread, and concurrent launches sometimes fail. One daemon thread owns it and takes calls from a
-queue; callers on any thread wait for their result.
+queue, while callers wait; short prepared launches run on the caller's thread while the owner waits.
 
 * ``COVIEW_KERNELS`` = ``quadrants``, ``taichi`` or ``numpy`` forces a backend; the default is the first usable one.
 * ``COVIEW_THREADS`` = 1, 2, ... bounds the threads of a kernel; the default is all cores of the process, up to 16.
@@ -177,7 +177,7 @@ def _cache_folder(library: Any) -> Path:
 
 
 def mark_of(names: Sequence[str]) -> Path | None:
-    """Return the file that marks kernels as stored for processes like this one; None if kernels are not kept."""
+    """Return the file that marks kernels as stored for such processes; None if a backend runs or keeps no kernels."""
     name = _choose()
     if _backend is not None or name == "numpy":
         return None
@@ -306,7 +306,7 @@ def backend() -> str:
     """Return the backend that runs, ``taichi``, ``quadrants`` or ``numpy``; start it if need be.
 
     Raises:
-        ValueError: ``COVIEW_KERNELS`` names no backend.
+        ValueError: ``COVIEW_KERNELS`` names no backend, or ``COVIEW_THREADS`` is no positive whole number.
         ImportError: ``COVIEW_KERNELS`` names a backend that is missing, or that the host program uses.
     """
     global _owner, _backend

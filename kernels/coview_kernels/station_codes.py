@@ -51,12 +51,12 @@ _CHUNK = 4096  # pairs of station and shift at a time
 
 
 class Screen(NamedTuple):
-    """A query in integers."""
+    """A query in integers, for :meth:`StationCodes.best`."""
 
     integers: I16
     """(2, 16, 2, 16) for real and imaginary products."""
     turn: I16
-    """(65, 16) table of rotations."""
+    """(65, 16) zeros, then scaled cosines and minus sines of the 32 frequencies (rows) at 16 angles."""
     unit: float
     """Value of one unit of the turned products."""
 

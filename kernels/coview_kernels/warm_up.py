@@ -22,7 +22,7 @@ import numpy as np
 from coview_kernels import runtime
 
 SAMPLE = np.ones((2, 3), dtype=np.float32)
-"""A read-only cloud for the calls of :func:`compiled_by`."""
+"""A cloud for the calls of :func:`compiled_by`, which must not change it."""
 
 _PATIENCE = 600.0  # seconds to wait; compiling takes five on an idle computer, some minutes on the smallest boards
 _INTERVAL = 1.0  # seconds between checks of another process that compiles

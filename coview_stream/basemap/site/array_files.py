@@ -73,7 +73,7 @@ class ArrayFiles(MemoryArrays):
         return before
 
     def rows(self, name: str, begin: int, end: int) -> Array:
-        """Return a copy of rows of an array."""
+        """Return a copy of rows ``begin`` to ``end`` of an array; MapError if its file was cut off."""
         kind, (_, *rest) = self._shapes[name]
         width = kind.itemsize * math.prod(rest)
         out = np.empty((end - begin, *rest), kind)

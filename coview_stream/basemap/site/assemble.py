@@ -32,12 +32,12 @@ from coview_stream.geometry.transforms import Points
 
 log = logging.getLogger("coview_stream.maps")
 
-VERSION = 3  # of the arrays that are built from the same layers
+VERSION = 3  # in a working file's name; counts changes of the arrays that are built from the same layers
 PARAMETER = "made_tiles"
 """Parameter of a working file: each tile's state, first station, station count, first field row and row count."""
 
 _FIELD_MARGIN = 16.0  # metres around a tile that affect its field: one tile of the field
-_PORTION = 8192  # stations described at a time: 60 MB of descriptors
+_PORTION = 8192  # stations described at a time: 20 MB of descriptors per channel
 _LEARNED = ("local", "sigma", "tiles", "place", "place_at")
 
 
@@ -135,7 +135,7 @@ class SiteTiles:
         self.stations: dict[Key, Floats32] = {}
         self.grid = SiteGrid(manifest.origin, manifest.tile, self.config)
         self._entries, self._files = entries, into
-        self._clouds: dict[Key, str] = {}  # hash
+        self._clouds: dict[Key, str] = {}  # hash of the layer
         self._spans: dict[Key, tuple[int, int]] = {}
         self._cells: dict[Key, Ints] = {}
         self._index: list[Ints] = []
@@ -217,7 +217,7 @@ class SiteTiles:
         return {name: values[own] for name, values in made.items()}
 
     def _around(self, key: Key, margin: float) -> tuple[Points, Int8s]:
-        """Return points and packed normals within ``margin`` metres of a tile."""
+        """Return points (N, 3) and int8 normals (N, 3) within ``margin`` metres of a tile."""
         low = self.grid.corner(key)[:2] - margin
         high = low + self.grid.tile + 2.0 * margin
         clouds = []

@@ -34,13 +34,13 @@ CUBE = 0.5
 """Edge of a cube, metres: a cell of the likelihood field."""
 
 _FEATURES_TILE = 32  # metres
-_LIGHT = "light"  # parameter of a manifest
+_LIGHT = "light"  # parameter that only the manifest of a light copy has
 
 
 def split(arrays: Arrays, parameters: dict[str, Any], directory: Path, key: SigningKey | None = None) -> Manifest:
     """Write a map as a site into a directory that is new, empty or a site, signed if there is a key.
 
-    Points are rounded to 2 cm, normals to 2 degrees. MapError if the directory cannot be used.
+    Points are rounded to 2 cm, normals within 2.3 degrees. MapError if the directory cannot be used.
     """
     check_directory(directory)
     grid = SiteGrid((0.0, 0.0, 0.0), TILE, config_of_map(parameters["config"]))

@@ -174,7 +174,7 @@ def _deaf_to_interrupts() -> Iterator[None]:
 
 @contextmanager
 def _one_thread() -> Iterator[None]:
-    """Start processes with one thread each, as the workers run in parallel already."""
+    """Let processes started in the block use one thread for their libraries, as the workers run in parallel already."""
     before = {name: os.environ.get(name) for name in _ONE_THREAD}
     os.environ.update(dict.fromkeys(_ONE_THREAD, "1"))
     try:

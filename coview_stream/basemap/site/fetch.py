@@ -33,11 +33,11 @@ from coview_stream.clouds.fetch import open_web_file
 from coview_stream.clouds.progress import Progress
 from coview_stream.errors import CloudError, CoViewError, MapError, TransportError, require_library, warn
 
-_PIECE = 1 << 20
+_PIECE = 1 << 20  # bytes read at a time
 _PATIENCE, _SLOWEST = 30.0, 10_000.0  # seconds an answer may take, least bytes per second of one that takes longer
 
 log = logging.getLogger("coview_stream.maps")
-_TRIES, _WAIT = 3, 0.5  # tries for a layer, seconds before the second
+_TRIES, _WAIT = 3, 0.5  # tries for a layer, seconds before the third; half of them before the second
 
 
 class SiteSource(Protocol):

@@ -83,7 +83,7 @@ def most_bytes(layer: str, points: int, stations: int, tile: float, voxel: float
 
 
 def decode(raw: bytes, name: str, most: int = _MAX_BYTES) -> dict[str, npt.NDArray[Any]]:
-    """Decode untrusted bytes of :func:`encode` to read-only arrays.
+    """Decode untrusted bytes of :func:`encode` to arrays by name.
 
     MapError, with the layer's ``name``, if they are invalid or unpack to more than ``most`` bytes.
     """

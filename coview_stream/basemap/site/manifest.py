@@ -1,8 +1,8 @@
 """Manifest of a site, the JSON file ``manifest.json``: settings, and the tiles with the hashes of their layers.
 
-Its hash identifies the state of the whole site; its signature (ed25519) covers every byte of the layers. Readers verify
-the signature before they read anything else, then check all numbers and names tile by tile: other threads wait until
-one tile has been checked, not all, and a refused manifest takes no memory.
+Its hash identifies the state of the whole site. Its signature (ed25519) covers the layers by their hashes. Readers
+verify the signature before they read anything else. Then they parse and check the tiles one by one: other threads run
+in between, and a wrong manifest is refused before it fills the memory.
 """
 
 from __future__ import annotations

@@ -50,7 +50,7 @@ class SiteBuilt:
         source_points: number of points read.
         reused: number of tiles that existed already.
         skipped: sources and tiles that failed, with the reason, one line each.
-        low, high: (3,) corners of the sources, metres.
+        low, high: (3,) corners of the sources' extent, in their frame, metres.
     """
 
     manifest: Manifest
@@ -101,7 +101,7 @@ def build_site(
 
     Raises:
         CloudError: a source cannot be read. MapError: there are no stations, or the directory cannot be used.
-        ConfigError: a setting that sites cannot have. InputError: no weights for learned features.
+        ConfigError: a setting that sites cannot have. InputError: no weights for learned features, or an array.
     """
     if config.learned:
         from coview_stream.descriptors.network import VIEW_NAMES, weights_file
@@ -164,7 +164,7 @@ def build_site(
 
 
 def check_directory(directory: Path) -> None:
-    """Raise MapError for a directory that is not new, empty or a site."""
+    """Raise MapError for a directory that is not new, empty, a site or an unfinished build of one."""
     if directory.exists() and not directory.is_dir():
         raise MapError(f"{directory}: is a file; a site is a directory, a map in one file is called NAME.coview")
     if not directory.is_dir() or is_site(directory) or (directory / WORK).is_dir():

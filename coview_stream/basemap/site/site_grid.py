@@ -60,7 +60,7 @@ class SiteGrid:
 
 
 def origin_of(low: npt.ArrayLike, high: npt.ArrayLike) -> tuple[float, float, float]:
-    """Return the origin of a site with corners (3,): its middle rounded to 320 m, its lowest z rounded to 10 m."""
+    """Return the origin of a site with corners (3,): its middle rounded down to 320 m, its lowest z rounded to 10 m."""
     middle = 0.5 * (np.asarray(low, dtype=np.float64) + np.asarray(high, dtype=np.float64))
     x, y = (math.floor(float(value) / TILE) * TILE for value in middle[:2])
     return x, y, round(float(np.asarray(low, dtype=np.float64)[2]) / 10.0) * 10.0

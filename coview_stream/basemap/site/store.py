@@ -40,7 +40,7 @@ def layer_path(sha256: str) -> str:
 
 
 class TileStore:
-    """Layers in the folder ``layers`` of a site's directory, or of a cache.
+    """Layers in the folder ``layers`` of a site's directory or of a mirror.
 
     Attributes:
         folder: folder of the files, with subfolders by the first two digits of their names.
@@ -166,7 +166,7 @@ def cache_bound() -> float:
 
 
 def evict(folder: Path, *keep: Path) -> None:
-    """Delete the least recently used working files and mirrors until the cache is within its bound.
+    """Delete the least recently used ``.coview`` files and mirrors until the cache is within its bound.
 
     Files that a process holds (:func:`hold`), and ``keep``, stay.
     """

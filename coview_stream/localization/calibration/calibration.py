@@ -1,4 +1,8 @@
-"""Calibration of sensor and odometry, and raw scans, which are levelled by it on access."""
+"""Calibration of sensor and odometry, and raw scans, which are levelled by it on access.
+
+Clouds *in the sensor's axes* are as received: in the body's axes by the stated mount. The calibration corrects this
+mount: *levelled* clouds are in the body's true axes.
+"""
 
 from __future__ import annotations
 
@@ -37,7 +41,7 @@ _MOVED = {
     "sigma_tilt": math.radians(1.0), "sigma_scale": 0.02, "sigma_turn": math.radians(0.02),
     "sigma_heading": math.radians(0.3), "sigma_lever": 0.02, "sigma_delay": 0.005,
 }  # fmt: skip
-"""Lower limits of the sigmas of a calibration from before the node started."""
+"""Lower limits of the sigmas of an earlier calibration: radians, factor, radians per metre, metres, seconds."""
 _ONE_SCAN = "is it the vehicle or the sensor? set --mount only if the lean stays in a run with odometry"
 HEADING_TOLERANCE, LEVER_TOLERANCE, CLOCK_TOLERANCE = math.radians(0.1), 0.005, 0.001
 """Sigmas of a mount taken from drawings and of clocks set by PTP or an edge: radians, metres, seconds."""
@@ -126,7 +130,7 @@ class Calibration:
         return SweepCorrection(self.R_body_cloud, self.scale)
 
     def leans_from(self, other: Calibration) -> float:
-        """Return the angle in radians between the levels of two calibrations."""
+        """Return the angle in radians between the rotations of clouds by two calibrations."""
         return rotation_angle(self.R_body_cloud.T @ other.R_body_cloud)
 
     def level(self, cloud: Points) -> Points:
@@ -135,10 +139,10 @@ class Calibration:
         return cloud if np.array_equal(T, np.eye(4)) else transform(T, cloud)
 
     def motion_covariance(self, step: Floats, turned: float = 0.0, change: Floats | None = None) -> Floats:
-        """Covariance (6, 6) over (rx, ry, rz, x, y, z) of odometry's motion between two clouds, in the step's axes.
+        """Covariance (6, 6) over (rx, ry, rz, x, y, z) that this calibration's errors give a motion between two clouds.
 
-        ``step`` is (3,) metres, ``turned`` radians about z, ``change`` (3,) the change of the body's velocities (x, y,
-        rotation about z) from the start of the motion to its end.
+        All is in the axes of ``step`` (3,), metres. ``turned`` is radians about z, ``change`` (3,) the change of the
+        body's velocities (x, y, rotation about z) from the start of the motion to its end.
         """
         along = np.concatenate([np.zeros(3), step])
         across = np.concatenate([np.zeros(3), [-step[1], step[0], 0.0]])
@@ -171,7 +175,7 @@ class Calibration:
 
     @property
     def extrapolation(self) -> Floats:
-        """(6, 6) covariance over (rx, ry, rz, x, y, z) of extrapolated late odometry, without recent accelerations."""
+        """(6, 6) covariance over (rx, ry, rz, x, y, z) of late odometry, extrapolated without accelerations."""
         grown = 0.5 * min(self.delay, 0.0) ** 2
         moved = (grown * _ACCELERATION) ** 2
         return np.diag([0.0, 0.0, (grown * _TURN_ACCELERATION) ** 2, moved, moved, 0.0])
@@ -179,7 +183,8 @@ class Calibration:
     def describe(self, mount: Mount | None = None, one_scan: bool = False) -> list[str]:
         """Return one clause of text per noticeable correction.
 
-        Signs are as in ``--mount``; ``mount`` is already applied to the clouds. ``one_scan`` has no motion.
+        Signs are as in ``--mount``; ``mount`` is already applied to the clouds. Without motion (``one_scan``) a
+        lean may also be the vehicle's.
         """
         clauses: list[str] = []
         given = mount or Mount()
@@ -236,7 +241,7 @@ class Calibration:
         return replace(self, **{name: max(getattr(self, name), least) for name, least in _MOVED.items()})
 
     def to_json(self) -> dict[str, Any]:
-        """Plain data: degrees, metres, factors."""
+        """Plain data: degrees, metres, seconds, factors."""
         deg = math.degrees
         return {
             "roll_deg": round(deg(self.roll), 2),
@@ -299,7 +304,7 @@ class RawScan:
 
     @property
     def position(self) -> Floats:
-        """(3,) sensor position in the odometry frame, metres."""
+        """(3,) position of the body in the odometry frame, metres."""
         return np.asarray(self.T_odom_body[:3, 3])
 
     def levelled(self, calibration: Calibration) -> Points:

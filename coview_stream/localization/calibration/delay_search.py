@@ -30,12 +30,12 @@ class SeenMotion(NamedTuple):
     begin: float  # stamp of the first cloud, seconds
     end: float  # stamp of the second cloud
     applied: Calibration  # calibration at that time
-    noise: Floats  # (3, 3) covariance of x, y and heading without the calibration's
+    noise: Floats  # (3, 3) covariance of x, y and heading without the calibration's errors
     J: Floats  # (3, 6) derivatives of x, y and heading by the calibration (eq. C2)
 
     @property
     def spread(self) -> Floats:
-        """(3, 3) covariance including the calibration's, except for the delay's."""
+        """(3, 3) covariance including the calibration's errors, except for the delay's."""
         known = self.applied
         sigmas = [known.sigma_scale, known.sigma_turn, 0.0, known.sigma_heading, known.sigma_lever, known.sigma_lever]
         others = self.J * np.array(sigmas)
@@ -88,7 +88,7 @@ class DelaySearch:
         return judged
 
     def _judge(self, seen: SeenMotion, odometry: OdometryHistory) -> None:
-        """Compare a motion with odometry at each delay, by the share of the noise that interpolation leaves there."""
+        """Compare a motion with odometry at each delay; interpolation leaves a share of odometry's noise there."""
         before, after = odometry.all_at(seen.begin - DELAYS), odometry.all_at(seen.end - DELAYS)
         R = before[:, :3, :3].transpose(0, 2, 1)
         moved = (1.0 + seen.applied.scale) * np.einsum("dij,dj->di", R, after[:, :3, 3] - before[:, :3, 3])

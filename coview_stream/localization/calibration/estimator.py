@@ -80,7 +80,7 @@ for _group in (*_GROUPS, GRAVITY):
     _WIDE[_group.axes] = _group.wide
 _MOTION = np.array([2, 3, 6, 7, 8, 9])  # components that affect a motion
 _FAULTY = {count: np.array(list(itertools.product([False, True], repeat=count))) for count in (1, 5)}
-"""Choices (M, groups) of faulty groups."""
+"""All choices (M, N) of the faulty ones among N groups, by N."""
 _DELAY, _BUT_DELAY = (np.arange(SIZE) == 6).astype(float), (np.arange(SIZE) != 6).astype(float)
 _FREE = 1e6  # variance, in units of the wide prior's, of a component that is left free
 _GUESSED = 0.9  # probability that a mount with only its angles stated is off by more than a drawing's tolerance
@@ -391,12 +391,12 @@ class CalibrationEstimator:
         self._apply()
 
     def widen_mount(self) -> None:
-        """Widen the mount, as the sensor may have been turned or shifted on the body."""
+        """Widen the sigmas of the mount, as the sensor may have been turned or shifted on the body."""
         self._delays.forget_motions()
         self._widen(_MOUNT)
 
     def widen_clock(self) -> None:
-        """Widen the delay, as the clock of clouds or odometry may have taken a step."""
+        """Widen the sigma of the delay, as the clock of clouds or odometry may have taken a step."""
         self._delays = DelaySearch()
         self._widen((_CLOCK,))
 
@@ -450,9 +450,9 @@ class CalibrationEstimator:
         Args:
             T_map_before: (4, 4) earlier pose, without the prior.
             T_map_body: (4, 4) later pose, likewise.
-            step: (4, 4) odometry between them, corrected by the calibration of its time.
-            noise: (3, 3) covariance of the motion's (x, y, heading), body's axes at the start, without the
-                calibration's.
+            step: (4, 4) odometry between them, corrected by the calibration of its time; below 0.2 m and 5 degrees it
+                shows nothing.
+            noise: (3, 3) covariance of the motion's (x, y, heading), body's axes at its start, but for the calibration.
             moments: of both poses; without them the motion shows no delay. A motion with unknown rates (NaN) is not
                 used: a robot that starts to move looks as if its clouds were late.
             contradicts: the motion contradicts odometry, perhaps by a slip, so it shows nothing of mount and clock.

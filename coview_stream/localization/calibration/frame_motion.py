@@ -39,9 +39,9 @@ from coview_stream.localization.registration.surfaces import (
 
 # set by hand
 _POORER = 3.0  # allowed multiple of odometry's configured drift
-_FAILS = 0.1  # probability that a registration fails; its sigmas then, radians and metres per metre
-_FAILED_ANGLE = math.radians(3.0)
-_FAILED = 0.15
+_FAILS = 0.1  # probability that a registration fails
+_FAILED_ANGLE = math.radians(3.0)  # sigma of a failed one's angles
+_FAILED = 0.15  # sigma of its position, metres per metre of motion
 
 Variances = Callable[[float, float], Floats]
 """Variances (6,) over (rx, ry, rz, x, y, z) of odometry's random walk, by metres driven and radians turned."""
@@ -82,7 +82,7 @@ class FrameMotion:
         """Register a frame to the previous keyframe; return its odometry (4, 4), corrected by the result.
 
         ``points`` (N, 3) float32 are one per voxel, in the sensor's axes. ``T_odom_body`` (4, 4) is corrected by the
-        calibration of ``estimator``, which receives the motion as a measurement. ``drift`` is odometry's.
+        calibration of ``estimator``, which receives the motion as a measurement. ``drift`` gives odometry's variances.
         """
         reference = self._reference
         if reference is not None:

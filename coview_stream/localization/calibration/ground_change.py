@@ -3,7 +3,7 @@
 The unknown is h, the height of odometry's frame on the map; it walks by odometry's drift. The ground around the robot
 is of one of two kinds: *as surveyed* (S), with most patches at the survey's height for the right h; or *changed* (C),
 as in a pit, with patches that tell nothing about h. A robot meets changed ground once in a kilometre and leaves it
-within some dozen metres. Each view gives two observations:
+within some thirty metres. Each view gives two observations:
 
 * Patches of ground, by their height above the survey's at the registered pose. Under S the likelihood is greatest at
   the h that puts most of them on the survey's ground. Changed ground has another shape than the survey's, or is a copy
@@ -48,7 +48,7 @@ _INDEPENDENT = 0.1  # observations per patch: ground within a dozen metres is du
 _SURVEY, _LEAN = 0.07, math.radians(0.5)  # one sigma of a patch's height, metres, and of the cloud's attitude
 _CHANGES = ((0.3, 0.5), (1.5, 0.5))  # metres, mean of a change by plants and of one by diggers; shares
 _KEPT = np.array([0.3, 0.5, 0.7, 0.85, 0.95, 0.99])  # shares of patches that are as surveyed, under S
-_KEPT_PRIOR = np.array([0.02, 0.03, 0.05, 0.1, 0.3, 0.5])
+_KEPT_PRIOR = np.array([0.02, 0.03, 0.05, 0.1, 0.3, 0.5])  # probabilities of these shares
 _ODDS = 4.0  # nats, most evidence of a single patch
 _ON_MAP = 0.5  # metres from a point that lies on the map to a map point
 
@@ -56,7 +56,7 @@ _ON_MAP = 0.5  # metres from a point that lies on the map to a map point
 # metres off by more than 4 nats
 _STRUCTURE = 0.3  # observations per patch of structure, as for a ground offset
 _SEEN = 10.0  # metres of driving over which the same structure stays in view
-_BLUR = 5  # shifts by which structure from below differs from structure from above
+_BLUR = 5  # shifts averaged, as structure from below differs from structure from above
 _VIEWED = 0.07  # metres, one sigma of a height by structure alone
 _ELSEWHERE = np.abs(_HEIGHTS) > np.array([[1.5 * _STEP], [_LEAST]])
 """(2, H) heights other than the registered one, by kind: surveyed ground resolves decimetres, structure does not."""
@@ -80,10 +80,10 @@ class GroundChange:
         self.share = self.metres = 0.0
         self._scan: RegistrationCloud | None = None  # the newest, with all of its ground
         self._started = False
-        self._T_map_source = np.eye(4)  # of the newest lesson
+        self._T_map_source = np.eye(4)  # of the newest learned registration
         self._h = 0.0  # metres by which registrations have raised the robot above odometry's path
         self._zeros = np.zeros(2)  # values of _h at the zero of the heights, of the kinds and of structure
-        self._lowered = 0.0  # metres by which the ground of the newest lesson was lowered
+        self._lowered = 0.0  # metres by which that registration's ground was lowered
         size = np.abs(_HEIGHTS) - _LEAST
         dug = np.where(size > 0.0, np.exp(-size / _DEPTH), 0.0)
         as_surveyed = np.exp(-0.5 * (_HEIGHTS / _START) ** 2)
@@ -292,7 +292,7 @@ class _Patches:
 
 
 def _blurred(values: Floats) -> Floats:
-    """Return the means (N,) of values (N,) within :data:`_BLUR` of each, mirrored at the ends."""
+    """Return the means (N,) over windows of :data:`_BLUR` values (N,), mirrored at the ends."""
     return np.convolve(np.pad(values, _BLUR // 2, mode="symmetric"), np.full(_BLUR, 1.0 / _BLUR), mode="valid")
 
 

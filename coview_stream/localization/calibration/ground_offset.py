@@ -21,8 +21,8 @@ from coview_stream.localization.registration.clouds import LocalMap, Registratio
 
 # set by hand on a simulated town and campus with their ground lifted by -0.2, 0 and 0.3 m, and checked on three real
 # runs and a real forest plot lifted likewise (docs/tracking.md); no command prints it
-_SHIFTS = 0.1 * np.arange(-7, 8)  # metres
-_OFFSETS = 0.02 * np.arange(-25, 26)  # metres
+_SHIFTS = 0.1 * np.arange(-7, 8)  # metres up at which scans are compared with the map
+_OFFSETS = 0.02 * np.arange(-25, 26)  # metres, of the hypotheses
 _REACH = 0.5  # metres to a map point
 _WIDTH = 0.15  # metres off its plane at which a point is half as good
 _POINTS = 400  # of structure and of ground

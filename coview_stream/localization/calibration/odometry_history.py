@@ -15,9 +15,9 @@ _REMEMBERED = 10.0  # seconds of odometry, longer than any queue of clouds
 
 
 class Moment(NamedTuple):
-    """Moment of a cloud."""
+    """Moment at which a cloud was measured, with the body's velocities then."""
 
-    stamp: float  # seconds
+    stamp: float  # of the cloud, seconds
     rates: Floats  # (3,) velocities x, y and rotation about z of the body, its axes; NaN if unknown
 
 
@@ -91,7 +91,7 @@ class OdometryHistory:
         return bool(self._stamps) and end <= self._stamps[-1]
 
     def all_at(self, stamps: Floats) -> Poses:
-        """Return the poses (N, 4, 4) at stamps (N,), interpolated, or extrapolated beyond the ends."""
+        """Return the poses (N, 4, 4) at stamps (N,), interpolated, or extrapolated beyond the ends; needs two poses."""
         known = np.array(self._stamps)
         after = np.clip(np.searchsorted(known, stamps), 1, len(known) - 1)
         low, high = after.min() - 1, after.max()

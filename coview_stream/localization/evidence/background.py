@@ -92,7 +92,7 @@ class Background:
 
 
 def outcomes(observed: Floats32) -> Floats:
-    """Return the shares (P, 4) of the structure's outcomes in observations (P, 7): on, near, edge, unexplained."""
+    """Return shares (P, 4) of the structure's outcomes in observations (P, 7 or 15): on, near, edge, unexplained."""
     on, near, edge, covered = (observed[:, k].astype(np.float64) for k in range(4))
     return np.column_stack([on, near - on, edge, np.maximum(covered - near - edge, 0.0)])
 
@@ -220,7 +220,7 @@ def estimate_background(now: Floats32, variance: Floats, ground: Floats32, most:
 def observe_with_background(
     field: kernels.FieldMap, scan: ObservedScan, T_map_odom: Floats
 ) -> tuple[Floats32, Background]:
-    """Return observations (P, 7) of the map from poses (P, 4, 4), and the background around the first."""
+    """Return a scan's observations (P, 7) at places ``T_map_odom`` (P, 4, 4), and the background around the first."""
     poses = scan.poses(T_map_odom)
     observed = scan.few.look_up(field, np.concatenate([poses, chance_places(poses[0])]), kernels.Move.NONE).shares
     places, chance = observed[: len(poses)], observed[len(poses) :]

@@ -184,5 +184,5 @@ def odds_of(gaps: Floats, variances: Floats) -> Floats:
 
 
 def expected_by_chance(ratio: float, count: int) -> float:
-    """Return the expected number of chance places, of ``count``, with a log-likelihood ratio of ``ratio`` or more."""
+    """Return an upper limit on the expected number of ``count`` chance places with a log-ratio of ``ratio`` or more."""
     return float(count * np.exp(-max(ratio, 0.0)))

@@ -97,10 +97,7 @@ def _all_shifts() -> Floats:
 
 
 def _shift_ratios(field: kernels.FieldMap, seen: SeenStructure, shifts: Floats) -> Floats | None:
-    """Return the log-ratios (H,) of "unexplained structure belongs at this shift" against chance.
-
-    None for too few points.
-    """
+    """Return the log-ratios (H,) of "unexplained structure belongs at this shift" to chance; None for few points."""
     if len(seen.unexplained) < _MIN_POINTS:
         return None
     fits = _in_patches(seen.unexplained) @ _explained(field, seen, shifts).T  # (P, H) shares
@@ -168,7 +165,7 @@ def _sample(points: Points) -> Points:
 
 
 def _explained(field: kernels.FieldMap, seen: SeenStructure, shifts: Floats) -> Floats:
-    """Return (H, N): 1 where an unexplained point, at a shift (H, 2), is near unexplained map structure."""
+    """Return (H, N): 1 where an unexplained point, shifted (H, 2), is near map structure without any of the scan."""
     explained = kernels.near_structure(field, seen.unexplained, seen.place, shifts)
     shift, point = np.nonzero(explained)
     if len(point):

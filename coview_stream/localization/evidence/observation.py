@@ -41,12 +41,12 @@ _CELLS = _COLUMNS * (math.ceil(math.pi / _BEAM) + 1)
 _BEAM_HITS = 2  # least returns in a cell
 _MAX_RAYS = 32_768  # of a frame: a dense lidar has tens of them in each cell
 _SLACK, _SLACK_SLOPE = 0.5, 0.03  # metres, and metres per metre of range, by which a ray has to end behind a point
-_MARGIN = 0.35  # metres from the middle of a cell of the field to its border
-_FLOOR_RADIUS = 10.0  # metres around the sensor in which its floor is measured
+_MARGIN = 0.35  # metres from the middle of a cell of the field to its corner
+_FLOOR_RADIUS = 10.0  # metres around the body in which its floor is measured
 _FLOOR_PERCENTILE = 5.0  # of the heights there: a few returns lie below the ground
-_MIN_FLOOR_POINTS = 20
+_MIN_FLOOR_POINTS = 20  # fewer show no floor
 _SAMPLES = 6000  # points sampled in the space around the robot
-_DEPTH = (-3.0, 9.0)  # metres, their heights relative to the sensor
+_DEPTH = (-3.0, 9.0)  # metres, their heights relative to the body
 _LAYERS = 2  # cells filled by a surface along a ray
 _VOXEL = 0.5  # metres between neighbouring points of a scan
 _POINTS_PASSED = np.pi * _RANGE**2 * (_DEPTH[1] - _DEPTH[0]) / _SAMPLES / (_LAYERS * 0.5) / _VOXEL**2
@@ -78,7 +78,7 @@ class Evidence:
 
     Attributes:
         near: structure (> 1 m above the ground) within half a metre of map structure; 0 for fewer than 60 points.
-        covered: structure that is near, or below a roof edge of the map.
+        covered: structure that is near, or below a roof edge of the map; 0 likewise.
         ground: ground points on the map's ground.
         free_space: map structure in sight of the robot that its rays met rather than passed through.
         inside: points in the surveyed area; the other shares ignore the rest.
@@ -222,10 +222,10 @@ def surroundings(scans: Sequence[ObservedScan]) -> float:
 
 @dataclass(frozen=True)
 class RangeImage:
-    """Nearest return of one frame by direction, in cells of 2 degrees."""
+    """Nearest return of one frame by its direction from the body's origin, in cells of 2 degrees."""
 
     nearest: Floats32  # (C,) metres; -inf where there are too few returns
-    floor: float  # height of the ground relative to the sensor, metres, at most 0
+    floor: float  # height of the ground relative to the body, metres, at most 0
 
     @classmethod
     def of(cls, cloud: Points) -> RangeImage:
@@ -277,7 +277,7 @@ def _directions(points: Points | Floats, ranges: Floats32 | Floats) -> Ints:
 
 @lru_cache(maxsize=1)
 def _samples() -> tuple[Floats, Floats, Ints]:
-    """Return points (N, 3) spread evenly over the space around the sensor, their ranges and cells of direction."""
+    """Return points (N, 3) spread evenly over the space around the body, their ranges and cells of direction."""
     rng = np.random.default_rng(20240)
     radius, turn = _RANGE * np.sqrt(rng.random(_SAMPLES)), 2.0 * np.pi * rng.random(_SAMPLES)
     height = rng.uniform(*_DEPTH, _SAMPLES)

@@ -25,7 +25,7 @@ from coview_stream.localization.evidence.observation import ObservedScan, Share
 
 _SHIFTS: Floats = np.array([(x, y, 0.0, 0.0) for y in range(-2, 3) for x in range(-2, 3)], dtype=np.float64)
 """Shifts of a path, metres: the basin of a place."""
-_TURNS: Floats = np.radians(1.0) * np.array([[0.0, 0.0, 0.0, turn] for turn in (-1, 0, 1)])
+_TURNS: Floats = np.radians(1.0) * np.array([[0.0, 0.0, 0.0, turn] for turn in (-1, 0, 1)])  # of a shifted path
 _DRIFT = 0.02, 0.05  # of odometry between keyframes, one sigma: share of the distance, and metres
 _SCATTER = 0.2  # metres of a pose about its path where few poses show it: cells are half a metre wide
 _WEIGHT = 4.0  # of that scatter, in degrees of freedom

@@ -19,7 +19,7 @@ LONGEST = 12.0
 _SCALES = (1.5, 0.8, 0.4)  # metres: largest correspondence distances of the registration, coarse to fine
 _FARTHER = 3.0  # metres, first scale from a start without a prior
 _FREE = np.array([math.radians(2.0), math.radians(2.0), math.radians(3.0), 0.05, 0.05, 0.05])
-_FREE_METRE = 0.1  # prior sigmas of the motion about its start: constant, and metres per metre of motion
+_FREE_METRE = 0.1  # prior sigmas of a motion about its start: radians and metres; metres more per metre of motion
 
 # sigmas of a registered motion
 _POSITION = 0.02  # metres
@@ -27,8 +27,8 @@ _POSITION_METRE = 0.01  # per metre: as in three real runs at steps of two to ei
 _ANGLE = math.radians(0.2)
 
 # surface patches
-_CELL = 1.0  # metres
-_CELL_POINTS = 5
+_CELL = 1.0  # metres, edge of a cube
+_CELL_POINTS = 5  # least points in it
 _THICKNESS = 0.15  # metres, one sigma across
 _FLATTER = 2.0  # least ratio of width to thickness
 _RANGE_NOISE = 0.03  # metres: points along one ring form a line, whose width is mere noise

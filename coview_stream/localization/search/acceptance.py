@@ -24,7 +24,6 @@ BY_FEATURES = " (by learned features)"
 IN_CIRCLE = " (searched in the circle given)"
 """End of a reason for no pose where only a circle was searched."""
 
-
 MAX_PLACES = 20  # a screen shows them clearly, and the message stays below 3 kB
 
 

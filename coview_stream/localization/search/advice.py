@@ -31,7 +31,7 @@ _SERIOUS, _MOST = 0.01, 5  # least probability of another place relative to the 
 
 
 class AdvisedSearch(GlobalSearch):
-    """Search whose result, if several places fit, advises where they differ.
+    """Search whose results, if several places fit, say where to drive to tell them apart.
 
     Attributes:
         considered: places of the newest keyframe, None without any.

@@ -40,21 +40,21 @@ _SHARPEST = np.radians(100.0)  # largest turn between two straights
 _STEP = 1.0  # metres; a path is open if all steps have a station
 _SHORTEST = 3  # least steps of a path
 _TALL, _HALF_WIDTH = 2.0, 0.8  # metres: height of obstacles, half width of the robot
-_STOREY = 2.5  # metres
-_KEPT_SCANS = 8
+_STOREY = 2.5  # metres, least height of a cell of the sample
+_KEPT_SCANS = 8  # newest virtual scans that are kept
 
 # of a virtual scan
-_RANGE = 40.0  # metres
-_NEAREST = 1.0  # metres
+_RANGE = 40.0  # metres, horizontally
+_NEAREST = 1.0  # metres; nearer points are left out
 _BEAM = np.radians(1.0)  # cell of the range image that models occlusion
 _UP, _DOWN = 22, 22  # cells above and below the horizon: the field of view of common lidars
 _COLUMNS = 360  # cells around
 _HOLES = ((7.0, 5), (16.0, 3))  # up to these metres, surfaces of quarter-metre voxels have gaps of so many cells
 _SLACK, _SLACK_SLOPE = 0.4, 0.03  # metres, and metres per metre of range, still visible behind the nearest point
-_NOISE = 0.03  # metres
+_NOISE = 0.03  # metres, sigma of each coordinate
 _CHANGE_PATCH = 4.0  # metres, edge of a patch that changes as a whole
-_MOVED = (3.0, 6.0)  # metres of its shift
-_TABLE = 64  # patches until the random draws repeat
+_MOVED = (3.0, 6.0)  # metres, range of its shift
+_TABLE = 64  # patches along each axis until the random draws repeat
 
 
 @dataclass(frozen=True, eq=False)
@@ -91,7 +91,7 @@ def ambiguity(
     """Measure a map's ambiguity at no more than ``count`` of its stations, evenly spread.
 
     The risk in ``config`` decides. ``changed`` is the share of the site in [0, 1] that has changed since the survey.
-    ``progress`` is called with the numbers of finished stations and of all.
+    ``progress`` is called with the numbers of finished stations and of all, then again for the simulated drives.
 
     Raises:
         MapError: the map's likelihood field cannot be used.

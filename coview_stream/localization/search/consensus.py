@@ -32,9 +32,9 @@ class Hypothesis:
     """A hypothesis of ``T_map_odom``, from the votes that name it to its registration."""
 
     T_map_odom: Pose  # (4, 4); after registration the registered pose
-    station: int | None = None  # index of the station; None for a pose hint, which has no votes
-    shift: int | None = None  # number of sectors; None for a pose hint
-    votes: float = 0.0  # sum of the votes, lower is better
+    station: int | None = None  # index of the station; None for a place that no vote has named, like a pose hint
+    shift: int | None = None  # number of sectors; None likewise
+    votes: float = 0.0  # sum of the votes over the root of their number, lower is better
     learned: bool = False  # whether learned features voted
     hinted: bool = False  # whether a pose hint led to this place
     score: float = 0.0  # of the newest keyframe, in [0, 1], by the field
@@ -80,7 +80,7 @@ class Vote(Protocol):
 class _Places:
     """N level hypotheses of ``T_map_odom`` and the votes on them."""
 
-    shift: Ints  # (N,) headings
+    shift: Ints  # (N,) headings, numbers of sectors
     offset: Floats  # (N, 3) float64 position of the odometry frame's origin; map frame, metres
     station: Indices  # (N,) of the newest keyframe, -1 for none
     votes: Floats32  # (N, W) z-scores of the keyframes in the window, 0 before they vote

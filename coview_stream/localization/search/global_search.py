@@ -27,7 +27,7 @@ from coview_stream.localization.search.request import EarlierKeyframe, Epoch, Re
 from coview_stream.localization.search.scoring import PlaceScorer
 
 _ORDINARY = 20_000  # stations up to which the configured number of co-view hypotheses is enough
-_GUESSES = 12  # poses of a guess tried per keyframe
+_GUESSES = 12  # most poses of a guess, and most rivals to register, that a keyframe tries
 _NAMED = 4  # places like the leader, and rivals, that are looked at more closely, and by the next keyframe
 _STREET = 12.0  # metres from the leader: reach of the farthest hypothesis around it after its largest move
 
@@ -185,7 +185,7 @@ class GlobalSearch:
         return result, scored
 
     def _registered_rivals(self, reading: Reading, leader: Hypothesis) -> list[Hypothesis]:
-        """Return the leader's best rivals, registered, with what their odds against it gain by that.
+        """Return the leader's best rivals, registered; their ``probability`` is the gain of their odds against it.
 
         A rival may have moved to a pose half a metre off its best one, where a copy of the leader explains far less.
         The next keyframe starts from the registered poses.
@@ -267,7 +267,7 @@ class GlobalSearch:
         return Reading(turned, scan, scored.together_with(upright.scored), found, level, scorer, turn)
 
     def _begin(self, request: SearchRequest) -> None:
-        """Restart with a request, or continue with its earlier keyframes, which is no other start."""
+        """Restart with a request, or continue with its earlier keyframes, which does not count as another start."""
         starts = self._scorer.starts + (bool(self._scorer.scans) and not request.earlier)
         keyframes = self._keyframes if request.earlier else 0
         self.clear()

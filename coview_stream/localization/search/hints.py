@@ -1,7 +1,4 @@
-"""Hints and guesses of the robot's place: further hypotheses for the search, none of them trusted.
-
-Only the circle of a guess is trusted: nothing outside is searched.
-"""
+"""Hints and guesses of a robot's place, none of them trusted but the circle of a guess, which limits the search."""
 
 from __future__ import annotations
 
@@ -146,9 +143,9 @@ def require_ground(guess: PlaceGuess, base_map: BaseMap) -> None:
 
 
 class PoseHints:
-    """Hints of a localizer to its search, stored as ``T_map_odom`` of corrected odometry about its own origin.
+    """Hints of a localizer to its search, stored as ``T_map_odom`` about the origin of corrected odometry.
 
-    The localizer moves this origin to an anchor, to a new one after each loss; here the move is undone.
+    The localizer uses odometry about an anchor (3,), another one after each loss; here all anchors are undone.
 
     Attributes:
         circle: circle on the map, metres from its zero, in which the robot is said to be; None for none.

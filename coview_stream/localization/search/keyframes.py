@@ -50,7 +50,7 @@ class Keyframe:
 
     @property
     def position(self) -> Floats:
-        """(3,) sensor position in the odometry frame, metres."""
+        """(3,) position of the body in the odometry frame, metres."""
         return self.scan.position
 
 
@@ -202,7 +202,7 @@ class OdometryCheck:
     def contradicts(self, points: Points, position: Floats) -> bool:
         """Compare a frame; True if it is the third in a row that does not overlap the reference frame.
 
-        ``points`` (N, 3) of the frame, one per voxel, and ``position`` (3,) of the sensor are in the odometry frame,
+        ``points`` (N, 3) of the frame, one per voxel, and the body's ``position`` (3,) are in the odometry frame,
         metres.
         """
         if len(points) < _MIN_POINTS:

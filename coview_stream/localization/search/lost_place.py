@@ -1,10 +1,10 @@
 """The lost place: odometry's path from the last known place, weighed against a search's first place.
 
 The robot is where odometry leads, within its drift, or odometry went wrong and the robot is anywhere. A first place
-within the drift is confirmed. One beside it contradicts odometry. Either odometry is wrong, with the odds of a jump and
-those of a slip by the clouds alone. Or the robot is where odometry leads, and the structure that fits at the first
-place has moved since the survey, or the scans fit at the path's end hardly less. After a loss among moved buildings,
-the evidence of the map alone puts a robot metres off its right path.
+within the drift is confirmed. One beside it contradicts odometry. Then either the path is wrong, by the odds of
+:class:`LostPlace`. Or the robot is at the path's end, and the structure that fits at the first place has moved since
+the survey, or the scans fit at the end hardly less. After a loss among moved buildings, the evidence of the map alone
+puts a robot metres off its right path.
 """
 
 from __future__ import annotations

@@ -80,7 +80,7 @@ class Scored:
         )  # fmt: skip
 
     def weighed(self, odds: Floats, first: Bools) -> Scored:
-        """Add knowledge that gives places (P,) prior odds beside their own; ``first`` (P,) are poses of the first."""
+        """Multiply the odds of places by 1 + ``odds`` (P,), as a prior; ``first`` (P,) masks the first's poses."""
         gain = np.where(first, 1.0 + odds[0], 1.0 + odds)
         probability = np.array([place.probability for place in self.places])
         right = (1.0 + odds[0]) * (1.0 - self.error)

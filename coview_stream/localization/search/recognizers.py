@@ -44,7 +44,7 @@ class SearchIndex:
 
     @classmethod
     def of(cls, base_map: BaseMap, config: LocalizerConfig, load: bool = True) -> SearchIndex:
-        """Return the index for ``config.reloc``, without spectra, and without the network unless ``load``.
+        """Return the index for ``config.reloc``, not yet prepared; ``load`` also loads and checks the network.
 
         ``auto`` warns of learned features that cannot be used, and does without them.
 

@@ -40,9 +40,8 @@ from coview_stream.localization.search.request import SearchRequest, same_place
 _WIDEST = 1.0  # metres; scoring moves to the best pose nearby, so coarser scales are not needed
 _EVERY = 3  # every third point is registered: changes the score by 0.002 and the pose by a centimetre
 _AROUND = 1.2  # metres to the other starts, slightly beyond the reach of registration
-_DIRECTIONS = 8
+_DIRECTIONS = 8  # of the other starts from the leader
 _SAME_METRES, _SAME_RADIANS = 0.3, np.radians(2.0)  # closer poses are one mode
-
 
 Beside = Callable[[Floats], Floats]
 """Returns the evidence of poses beside a place: :meth:`PlaceScorer.beside`."""
@@ -114,7 +113,7 @@ def find_modes(
 ) -> Modes:  # fmt: skip
     """Register a scan from poses around ``leader``, the registered ``place``, and weight the results within it.
 
-    The evidence is that of the reading's keyframes, by ``beside``.
+    ``beside`` returns the evidence of poses by the keyframes of the search.
     """
     candidates = [leader]
     for angle in 2.0 * np.pi * np.arange(_DIRECTIONS) / _DIRECTIONS:

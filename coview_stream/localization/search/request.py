@@ -63,7 +63,7 @@ class SearchRequest:
     T_odom_body: Pose  # (4, 4) of the keyframe
     scan: Points  # (N, 3) float32 virtual local scan, odometry frame, metres; empty without a descriptor
     submap: Points  # (N, 3) float32 points to register, of the newest keyframes, odometry frame
-    cloud: Points  # (N, 3) float32 newest frame, body frame
+    cloud: Points  # (N, 3) float32 newest frame, thinned to the rays of its range image, body frame
     travelled: float = 0.0  # metres that odometry had driven
     epoch: Epoch = FIRST_EPOCH  # a request of another epoch restarts the search
     hints: tuple[Pose, ...] = ()  # possible T_map_odom, each (4, 4), judged like the votes' hypotheses
@@ -81,7 +81,7 @@ class SearchRequest:
 
     @property
     def position(self) -> Floats:
-        """(3,) sensor position in the odometry frame, metres."""
+        """(3,) position of the body in the odometry frame, metres."""
         return np.asarray(self.T_odom_body[:3, 3])
 
     def turned(self, R: Floats) -> SearchRequest:

@@ -66,7 +66,7 @@ class Followed:
     """P followed places and their observations."""
 
     hypotheses: list[Hypothesis]  # at the newest keyframe
-    votes: Ints  # (P,) rank of each in the newest votes that named it, from 0
+    votes: Ints  # (P,) best rank of each in the votes, from 0; one more for each keyframe since
     observed: Floats32  # (P, W, 15) observations at and around the places at the keyframes, oldest first
     poses: Floats  # (P, W, 4) poses of these observations
     newest: Ints  # (P,) rows among the newest keyframe's poses
@@ -108,7 +108,7 @@ class PlaceScorer:
     Attributes:
         starts: number of starts of the search since a place was accepted.
         area: the only searched part of the map; None for all of it.
-        chance: poses (S, 4) of chance places at the newest keyframe, observations (S, W, 15) there at all keyframes.
+        chance: chance places: poses (S, 4) at the newest keyframe, observations (S, W, 15) there at all keyframes.
     """
 
     def __init__(self, base_map: BaseMap) -> None:

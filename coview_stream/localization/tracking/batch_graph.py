@@ -65,7 +65,7 @@ class BatchGraph:
         self._kernels: list[tuple[slice, tuple[str, float]]] = []
 
     def add(self, constraints: Sequence[Constraint], kernel: tuple[str, float] | None = None) -> None:
-        """Add constraints, under a kernel (``"Huber"``, ``"Cauchy"``) with its width in sigmas."""
+        """Add constraints, under a kernel (``"Huber"``, ``"Cauchy"``) with its width in sigmas; None is quadratic."""
         begin = len(self._constraints)
         self._constraints += constraints
         if kernel is not None:

@@ -42,7 +42,7 @@ class Rival:
     """A probable pose other than a registered one."""
 
     T_map_odom: Pose  # (4, 4) as registered there
-    ratio: float  # log-likelihood ratio of the scan there against chance around the registered pose
+    ratio: float  # log-likelihood ratio of the scan at this rival against chance around the registered pose
 
 
 def find_rivals(
@@ -53,10 +53,10 @@ def find_rivals(
     config: RegistrationConfig,
     count: int = 1,
 ) -> list[Rival]:
-    """Return the most probable poses around a registered one that do not converge to it; perhaps none.
+    """Register the most probable poses around a registered one; return those that do not converge to it, best first.
 
     After a slip, registration starts beside the right place, and a wall moved since the survey may hold it there. So
-    the scan is compared with the map on rings of poses around, and the ``count`` most probable ones are registered,
+    the scan is compared with the map on rings of poses around, and up to ``count`` most probable ones are registered,
     too: a place has to explain the scan better than its best rival. A count above 1 also tries other headings.
     """
     here = scan.poses(T_map_odom[None])[0]
@@ -81,7 +81,7 @@ def find_rivals(
 
 
 def _beside(scan: ObservedScan, T_map_odom: Pose, T_map_other: Pose) -> bool:
-    """Return whether two poses of a scan differ too much in the plane, where wheels slip."""
+    """Return whether two poses of a scan are too far apart for both to be right; heights do not count."""
     along, other = T_map_odom @ scan.T_odom_body, T_map_other @ scan.T_odom_body
     along[2, 3] = other[2, 3]
     return matters(*off_by(along, other))
@@ -100,9 +100,9 @@ class MapMatch:
     """Registration while tracking, with the verdict that decides its use."""
 
     verdict: MatchVerdict  # the decision and its reason
-    T_map_body: Pose  # (4, 4) without the prior
+    T_map_body: Pose  # (4, 4) by the map alone, without the prior; the belief if registration failed
     covariance: Floats  # (6, 6) as in an Estimate, without the error that the next registration repeats
-    innovation: float = 0.0  # squared Mahalanobis distance from the graph's prediction, by all errors
+    innovation: float = 0.0  # squared Mahalanobis distance from the graph's prediction, by the errors of both
     scan: ObservedScan | None = None  # the registered scan; None if registration failed
     target: LocalMap | None = None  # the map around it; None likewise
     rivals: tuple[Rival, ...] = ()  # other poses metres away, most probable first, if searched for
@@ -148,7 +148,7 @@ class MapMatcher:
         predicted: Estimate,
         rivals_wanted: int = 1,
     ) -> MapMatch:
-        """Register from ``belief``, which is the prior (eq. 13) and stays if that fails; verify and judge.
+        """Register a scan with ``belief`` as start and prior (eq. 13), verify and judge; a failure returns the belief.
 
         ``predicted`` is the graph's estimate, for the innovation; ``rivals_wanted`` limits the search for rivals.
         """

@@ -3,8 +3,8 @@
 Two hypotheses are compared: the robot is at the tracked place, or it is not (odometry jumped, the robot was carried,
 the place was wrong from the start). A registration weighs them by its log-likelihood ratio
 (:mod:`coview_stream.localization.tracking.place_evidence`); driving makes the second slightly more probable. Poses are
-reported while its probability is below the integrity risk; above one half the place is lost, which takes two views at
-the usual risk, as a scan may show nothing of the right place. docs/integrity.md has the equations.
+reported while the second has a probability below the integrity risk; above one half the place is lost, which takes two
+views at the default risk, as a single scan may show nothing of the right place. docs/integrity.md has the equations.
 """
 
 from __future__ import annotations
@@ -24,10 +24,10 @@ from coview_stream.localization.tracking.place_evidence import Observation
 
 # prior probabilities that a place becomes wrong; set by hand
 PER_METRE = 1e-5  # once in 100 km odometry jumps, or the robot is displaced
-_PER_SECOND = 1e-4  # in doubt: a blind robot may be driving elsewhere
+_PER_SECOND = 1e-4  # in doubt, and since the last verified pose once lost: a blind robot may be driving elsewhere
 _UNSEEN = 5e-4  # while the robot was out of contact
 _NOTHING = 1e-3  # probability that a scan shows nothing of the right place: a lorry hides it, garbage
-_NO_SCORE = 1e-6  # least score, which gives levels of kilometres
+_NO_SCORE = 1e-6  # least score to divide by; it makes protection levels of kilometres
 _OFF_MAP = 0.3  # share of the scan on the map below which the reason mentions it; decides nothing
 _NEWEST_SHARE = 0.2  # weight of new shares in the usual ones: averages about five registrations
 
@@ -80,13 +80,13 @@ _AT_ONCE = (
 
 @dataclass(frozen=True)
 class MatchVerdict:
-    """Verdict on one registration; without one only ``cause`` and ``reason``."""
+    """Verdict on one registration; if that failed or was not tried, the innovation and perhaps more is None."""
 
     cause: RejectionReason  # of the decision
     reason: str  # one clause for people
     evidence: Evidence | None = None  # at the registered pose
-    innovation: float | None = None  # squared Mahalanobis distance to the prediction
-    observation: Observation | None = None  # likelihood of the scan at the pose, against chance
+    innovation: float | None = None  # squared Mahalanobis distance to the prediction, 6 degrees of freedom
+    observation: Observation | None = None  # likelihood of the scan at the pose, against chance and rivals
 
     @property
     def verified(self) -> bool:
@@ -170,7 +170,7 @@ class LossMonitor:
         self._viewed_at = -math.inf  # metres driven at the start of the view
         self._newest: tuple[float, float] | None = None  # stamp and metres driven, of the newest registration
         self._since: float | None = None  # stamp of the first doubted registration
-        self._seen_since = 0.0  # stamp of the first doubted registration that was not blind
+        self._seen_since = 0.0  # stamp of the newest blind registration of the doubt, else of its first
         self._required = False  # whether a registration has to be believed before the next pose
 
     def odds(self, stamp: float, travelled: float) -> float:

@@ -31,7 +31,7 @@ _MEMORY = 40.0  # metres over which measured drift is forgotten
 _OUTLIER = 16.0  # variances; limit for larger slips, as rates should grow step by step
 _MIN_STEP = 0.2  # metres; on shorter steps the registrations' noise hides the drift
 _MIN_TURN = float(np.radians(5.0))  # likewise
-_TREMBLE = float(np.radians(0.03))  # jitter of odometry's roll and pitch, before it is measured
+_TREMBLE = float(np.radians(0.03))  # sigma of a frame's jitter in roll and pitch, before it is measured
 _TREMBLE_COUNT, _MAX_COUNT = 5.0, 40.0  # weight of this value in registrations, and memory of the estimate
 _MIN_DRIVEN = 1e-3  # metres: keeps the covariance positive definite when standing still
 
@@ -97,8 +97,8 @@ class DriftEstimator:
         """Add the motion between two registrations, where it is :func:`worth_learning`.
 
         ``gap`` (6,) over (rx, ry, rz, x, y, z) is the later pose minus odometry's prediction from the earlier one,
-        ``noise`` (6,) the variances of the two registrations alone, with metres ``driven`` and radians ``turned``
-        between.
+        ``noise`` (6,) the sum of the independent variances of the two registrations, with metres ``driven`` and radians
+        ``turned`` between.
         """
         nominal = self._nominal.variances(driven, turned)
         now = self.drift.variances(driven, turned)
@@ -191,7 +191,7 @@ class OdometryTracker:
         return inverse(self._keyframe.T_odom_body) @ T_odom_body
 
     def change(self) -> Floats:
-        """Return the derivative (3,) by the delay of the motion since the newest keyframe: x, y, yaw in its axes."""
+        """Return the derivative (3,) by the clouds' delay of the motion since the newest keyframe: x, y, yaw there."""
         motion = np.eye(4) if self.pose is None else self.motion(self.pose)
         return np.asarray(motion_jacobian(motion, np.array([_rates(self._keyframe.moment), self.rates]))[:, 2])
 
@@ -207,7 +207,7 @@ class OdometryTracker:
 
     @property
     def tremble(self) -> Floats:
-        """Covariance (6, 6) of a frame's tilt relative to neighbouring frames; see :class:`DriftEstimator`."""
+        """Covariance (6, 6) of a frame's tilt relative to neighbouring frames; see :attr:`DriftEstimator.tremble`."""
         return self._estimator.tremble
 
     def learn(self, T_map_cloud: Pose, covariance: Floats, slips: bool = False) -> None:
@@ -236,7 +236,7 @@ class OdometryTracker:
         self._unconfirmed = None
 
     def _learn(self, now: _Registered, contradicts: bool = False) -> None:
-        """Learn from a registration, which may strongly contradict odometry."""
+        """Learn from a registration; ``contradicts`` if it contradicts odometry, which drifts or slips."""
         before = self._registered
         if before is not None:
             driven, turned = now.mark.travelled - before.mark.travelled, now.mark.turned - before.mark.turned

@@ -27,7 +27,7 @@ from coview_stream.localization.evidence.observation import ObservedScan
 _SPREAD = 0.05  # sigma of the change of the unchanged share q between two registrations
 _ANOTHER = 0.01  # probability that the kind of survey and the leaks change between two registrations
 _CHANGED = 1e-4  # probability that the whole site changes between two registrations
-_BESIDE = 0.5  # probability that the right place is metres from a wrong one, by a slip of odometry
+_BESIDE = 0.5  # probability that a wrong place is metres off, by a slip of odometry, and not anywhere
 
 
 @dataclass(frozen=True)
@@ -35,7 +35,7 @@ class Observation:
     """Evidence of a scan for a pose."""
 
     ratio: float  # log-likelihood ratio of "the robot is here" against chance
-    likelihoods: Floats  # (Q, D, L) log-likelihood ratios by nuisance values
+    likelihoods: Floats  # (Q, D, L) log-likelihood ratios by unchanged share, kind of survey and leaks
     rival: float = 0.0  # log-likelihood ratio of the most probable pose metres away; that of chance without any
 
     @property

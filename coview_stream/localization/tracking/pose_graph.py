@@ -1,7 +1,7 @@
 """Pose graph while tracking: a chain of keyframes, and the covariance of the newest.
 
 The unknowns are the poses X_k = ``T_map_body`` of successive keyframes. With e(A, B) = log(A^-1 B), the difference of
-two poses in the tangent of the body, the estimate is the most probable one given
+two poses in the tangent of the body, the estimate is the most probable chain given
 
 * a prior on the first: e(T_prior, X_0) ~ N(0, P)
 * odometry: e(Z_k, X_{k-1}^-1 X_k) ~ N(0, Q_k)
@@ -171,7 +171,7 @@ class PoseGraph:
         return self._keyframes[-1]
 
     def _belief(self) -> _Gaussian:
-        """Return the newest keyframe's pose and covariance; the first call solves."""
+        """Return the newest keyframe's pose and covariance; the first call after a correction solves."""
         newest = self._newest
         if self._newest_belief is None:
             self._filter()

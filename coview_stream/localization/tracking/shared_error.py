@@ -33,7 +33,7 @@ _STEP = 2.0  # metres of driving between two updates
 _EVERY = 2  # every second point is used: more change nothing
 _MIN_PAIRS = 50
 _SHIFT = 0.03  # least metres by which the pose is moved to search partners again: above scanner noise
-_FARTHEST = 1.5 * RESIDUAL_SCALE  # farther off, the weights fall faster than residuals grow
+_FARTHEST = 1.5 * RESIDUAL_SCALE  # metres, limit of that shift: farther off, weights fall faster than residuals grow
 _LEVER = 17.0  # metres; at this lever arm a rotation moves points as far
 _TURNS = (0.0, 0.25 * np.pi)  # radians: two cuts into quadrants, as a wall may lie along a cut
 _SECTORS = 8  # four quadrants, ground and structure apart
@@ -41,10 +41,10 @@ _LEAST = 0.03  # least curvature of a direction relative to the others'; less is
 
 
 class SharedErrorModel:
-    """Running mean and scatter of the pairs' disagreement by sector, and the resulting covariances.
+    """Running mean and scatter of the gradients by sector, and the covariances that follow from them.
 
     Attributes:
-        repeats: number of registrations, so near to each other, that count as one.
+        repeats: number of registrations, spaced like the present one and the last, that count as one.
     """
 
     def __init__(self, config: RegistrationConfig) -> None:
@@ -90,7 +90,7 @@ class SharedErrorModel:
 
     @property
     def covariance(self) -> Floats:
-        """(6, 6) over (rx, ry, rz, x, y, z), map axes: ``shared`` times the mean's sandwich, and the floor."""
+        """(6, 6) over (rx, ry, rz, x, y, z), map axes: ``shared``^2 times the mean's sandwich, and the floor."""
         sandwich = np.zeros((6, 6))
         if self._learned_at is not None:
             sandwich = clustered_covariance(self._gradients, self._curvature)
@@ -166,7 +166,7 @@ def disagreement(
 
 
 def _disparity(moved: Points, partner: Ints, target: LocalMap) -> float:
-    """Return the median distance, metres, of points to their partners' planes; ``partner`` (N,) is -1 without one.
+    """Return the median distance of points to their partners' planes, 0.03 to 0.15 m; ``partner`` (N,) is -1 for none.
 
     Partners change over about this distance: a wall of the map is as thick as its points are imprecise or sparse.
     """

@@ -1,8 +1,8 @@
-"""Evidence of a slip or a displaced robot, between two registrations and where they contradict odometry.
+"""Evidence of a slip or a displaced robot: where a registration contradicts odometry, and between registrations.
 
-A registration may fit away from odometry's pose. Either odometry is wrong (wheels slip, the robot is pushed) and the
+A registration may fit beside the pose by odometry. Either odometry is wrong (wheels slip, the robot is pushed) and the
 lidar is right, or odometry is right and a building or a stack of containers stands a metre off its surveyed place. The
-scans decide, by the likelihood ratio of one place against all others, given the usual shares of this place.
+scans decide, by the likelihood ratio of one place against all others, given how well scans usually fit here.
 """
 
 from __future__ import annotations
@@ -38,9 +38,9 @@ class Dispute:
     """Candidate places while odometry is contradicted, and the scans' evidence for each of them.
 
     The first is odometry's. Scans within one view (a metre) see the same, so the newest of a view counts, and views add
-    up. A place that appears later starts with the evidence of the first. Odometry's prior is the
-    probability, by the clouds alone, that it has not slipped. And structure that fits beside it may have moved since
-    the survey, however many scans show that.
+    up. A place that appears later starts with the evidence of the first. Odometry's prior is the probability, by the
+    clouds alone, that it has not slipped. Structure that fits only at another candidate may have moved since the
+    survey, however many scans show it there.
     """
 
     def __init__(self, place: PlaceEvidence, view: float) -> None:
@@ -93,7 +93,10 @@ class Dispute:
         return here[best] if leads() else None
 
     def _assign(self, T_map_predicted: Pose, T_map_seen: Sequence[Pose], T_odom_body: Pose) -> list[int]:
-        """Return the nearest candidate of each registered pose, moved there; a pose far from all becomes a new one."""
+        """Return the index of each registered pose's nearest candidate, moved there; one far from all is a new one.
+
+        Odometry's candidate, the first, follows ``T_map_predicted`` instead.
+        """
         T_body_odom = inverse(T_odom_body)
         self._poses[:1] = [T_map_predicted @ T_body_odom]
         self._before = self._before if len(self._before) else np.zeros(1)
@@ -112,10 +115,10 @@ class Dispute:
 
 
 _REACH = 0.3  # metres: about the map's point spacing
-_MIN_RANGE, _MAX_RANGE = 2.0, 35.0  # metres from the sensor
+_MIN_RANGE, _MAX_RANGE = 2.0, 35.0  # horizontal metres from the body
 _HEIGHT = 1.0  # metres above the lowest ground nearby
-_FLOOR_RADIUS = 10.0  # metres, of that ground
-_POINTS = 400  # compared
+_FLOOR_RADIUS = 10.0  # metres within which the lowest 5 % of the points show it
+_POINTS = 400  # compared, at most
 _MIN_POINTS = 60
 _NEWEST_SHARE = 0.3  # weight of a new share in the usual one: averages about three registrations
 _DROP = 0.7  # of the usual share: see DisplacementCheck
@@ -136,7 +139,7 @@ class DisplacementCheck:
     def learn(self, points: Points, position: Floats, T: Pose, target: LocalMap) -> None:
         """Add a frame with a verified registration ``T`` (4, 4), map <- frame; others would make a slow error usual.
 
-        Its points (N, 3) float32 and the sensor's ``position`` (3,) are gravity-aligned, metres.
+        Its points (N, 3) float32 and the body's ``position`` (3,) are in that level frame, metres.
         """
         share = share_on_map(points, position, T, target)
         if share is not None:

@@ -32,17 +32,17 @@ from coview_stream.localization.tracking.slip import DisplacementCheck
 
 _MIN_POINTS = 100  # to register
 _MIN_DISTANCE = 0.3  # metres; no uncertainty requires an earlier registration
-_LEAST_DISTANCE = 0.05  # metres; a registration nearer to the last one repeats its error, except for a sixth
+_LEAST_DISTANCE = 0.05  # metres; of registrations this near to each other or nearer, six count as one
 _MAX_SIGMA = 0.03  # metres of odometry's drift in x or y that require a registration
 _MAX_YAW_SIGMA = math.radians(0.2)  # likewise for its heading
 _STANDING_DRIVE = 0.2  # metres of driving that a standstill between registrations counts as
 _START = np.diag([np.radians(0.3), np.radians(0.3), np.radians(1.5), 0.5, 0.5, 0.3]) ** 2
-"""Covariance of an accepted place, whose registration may not have converged."""
+"""Covariance added to that of an accepted place, whose registration may not have converged; rotations first."""
 _SLIP = np.diag([np.radians(0.5), np.radians(0.5), np.radians(5.0), 1.0, 1.0, 0.3]) ** 2
-"""Covariance of odometry that contradicts the lidar: slipping wheels, a carried robot."""
+"""Covariance added where odometry contradicts the lidar, as wheels may slip or the robot be carried."""
 
 _RISEN = np.diag([np.radians(1.0), np.radians(1.0), 0.0, 0.0, 0.0, 0.3]) ** 2
-"""Covariance of a height by structure alone, and of an attitude by odometry."""
+"""Covariance added where only structure shows the height, and only odometry the attitude."""
 
 
 class Tracker:
@@ -90,7 +90,7 @@ class Tracker:
         self.odometry.forget_pose()
 
     def forget_scans(self) -> None:
-        """Drop all points; the next registration uses only the next frame."""
+        """Drop all points; the next registration uses only later frames."""
         self._scans.keep_newest(0)
 
     def prefetch_map(self, T_odom_body: Pose) -> None:
@@ -122,7 +122,7 @@ class Tracker:
         """Start at an accepted place, with a wide covariance.
 
         ``registration``, metres ``travelled`` and ``T_odom_found`` (4, 4) are of the accepted keyframe, ``T_odom_body``
-        (4, 4) is of the newest frame; without ``T_odom_found`` this is the keyframe.
+        (4, 4) is of the newest frame; without ``T_odom_found`` the newest frame is the keyframe.
         """
         self._matcher.clear()
         self.ground.clear()
@@ -232,8 +232,8 @@ class Tracker:
     def reported_covariance(self, mount_and_clock: bool = True) -> Floats:
         """Covariance (6, 6) over (x, y, z, roll, pitch, yaw), map axes, of the body at the stamp.
 
-        It is the sum of the covariances of the cloud's pose by the graph and of odometry since, of the error shared by
-        registrations, the tilt's jitter, the height by the ground and, if ``mount_and_clock``, of mount and clock.
+        It is the sum of the covariances of the cloud's pose by the graph and of odometry since, of the error that
+        registrations repeat, the tilt's jitter, the ground's height and, if ``mount_and_clock``, of mount and clock.
         """
         total = self.predicted_covariance() + self._matcher.shared.covariance + self.odometry.tremble
         total[5, 5] += self.change.others.variance + self.change.alone + self.ground.sigma**2
@@ -243,7 +243,7 @@ class Tracker:
         return swap_rotation_translation(total)
 
     def protection_level(self) -> ProtectionLevel:
-        """Metres and degrees that the error exceeds once in a thousand poses; wider on less evidence than usual."""
+        """Error exceeded in at most one pose of a thousand, metres and degrees; wider on less evidence than usual."""
         others = self._calibration.calibration.heights(self.change.others)
         return protection_level(self.reported_covariance(), self._doubt, others=others)
 
@@ -288,7 +288,7 @@ class Tracker:
         self.T_map_odom = self.belief.T_map_body @ inverse(T_odom_body)
 
     def _learn(self, match: MapMatch, position: Floats, slips: bool) -> float:
-        """Learn from a verified registration: odometry's drift, the usual shares here, and systematic errors.
+        """Learn from a verified registration: odometry's drift, the usual evidence here, and systematic errors.
 
         Return metres by which the robot has to rise, as the ground is not the survey's.
         """

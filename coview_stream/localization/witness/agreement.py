@@ -28,7 +28,7 @@ ALONE = 0.05
 ANYWHERE: Floats = np.array([2.0, 2.0, math.radians(20.0)])
 """Scale of a wrong registration about odometry's motion: metres, radians."""
 _APART = 0.7  # probability that clouds of several places do not fit each other
-_ACCELERATIONS = np.array([0.25, 0.25, 0.12])  # m/s^2 and rad/s^2 of wheeled robots beyond the speeds around a hole
+_ACCELERATIONS = np.array([0.25, 0.25, 0.12])  # sigmas in a hole of odometry, beyond the speeds around: m/s^2, rad/s^2
 _WHOLE = 0.01  # seconds^2; odometry of five frames per second has no holes
 
 
@@ -47,14 +47,14 @@ class Step:
     odometry: Seen
     clouds: Seen | None  # None if there is too little to register
     on_map: Seen | None  # None without a verified registration at both ends
-    path_before: Floats  # (L, 3) odometry's planar poses by LAGS before the start of the step
+    path_before: Floats  # (L, 3) odometry's planar poses by the LAGS of faults.py before the start of the step
     path_now: Floats  # likewise before its end
     fails: float = FAILS  # probability that the clouds' registration is wrong, by their fit
     apart: bool = False  # whether the clouds fit each other much less than usual
-    alone: float = ALONE  # probability of that at one place
+    alone: float = ALONE  # probability of ``apart`` for clouds of one place
     copied: bool = False  # whether the clouds are identical bytes
     same: float | None = None  # share of unmoved points, if the clouds hardly moved
-    unsure: Floats | None = None  # (2, L) seconds^2 of accelerations hidden in holes of odometry at these poses
+    unsure: Floats | None = None  # (2, L) seconds^2 by which unseen accelerations move these poses, in odometry's holes
     stamps: StepStamps | None = None  # of the clouds
     start: Floats | None = None  # (3,) second start of the clouds' registration beside odometry's motion
     tilting: float = 0.0  # radians per second of the body about its x and y
@@ -104,9 +104,9 @@ def _wrong(step: Step, seen: Seen) -> float:
 
 
 def at_once(step: Step, covariance: Floats) -> float:
-    """Return the likelihood that clouds left odometry's motion at one moment of a step: in one of its parts.
+    """Return the likelihood that clouds left odometry's motion at one moment: in another part of the step both agree.
 
-    A body that is carried, or whose wheels slip, leaves it gradually.
+    It is 1 without parts. A body that is carried, or whose wheels slip, leaves odometry's motion gradually.
     """
     gaps = [between(odometry, clouds) for _, odometry, clouds in step.parts]
     squares = [float(gap @ np.linalg.solve(covariance, gap)) for gap in gaps]
@@ -145,7 +145,7 @@ def normal(gap: Floats, covariance: Floats) -> Floats:
 
 
 def density(C: Floats, covariance: Floats) -> float:
-    """Return the density of a planar motion (3,) about zero, by a covariance (3, 3)."""
+    """Return the density of a planar motion ``C`` (3,) about zero, by a covariance (3, 3)."""
     return float(normal(C, covariance))
 
 
@@ -158,5 +158,5 @@ def unsure(step: Step) -> Floats | None:
 
 
 def hidden_by(seconds: Floats) -> Floats:
-    """Covariance (..., 3, 3) of accelerations over half of ``seconds`` (...) squared, hidden from odometry."""
+    """Covariance (..., 3, 3) of motions by accelerations hidden from odometry, ``seconds`` (...) in seconds^2."""
     return np.asarray(np.square(seconds)[..., None, None] * np.diag(_ACCELERATIONS**2))

@@ -37,7 +37,7 @@ _FEWEST = 40  # points of structure; fewer do not show the clouds' motion
 _COARSE = 0.4  # metres, for the fit of starts before registration
 _USUAL = 0.7  # share of the usual fit below which other starts are tried
 _LEARNS = 0.1  # weight of a new fit in the usual one
-_STARTS = 2  # best of those, which are registered
+_STARTS = 2  # best of those starts, which are registered
 ALIKE = 0.03
 """Difference of fits below the resolution of counting so many points (one sigma)."""
 APART = 2.0
@@ -45,7 +45,7 @@ APART = 2.0
 _STAYS = 0.06  # metres: three sigmas of a motion
 _NEAR_ZERO = 0.3  # metres and radians, largest motion of a copy
 _SAME = 0.05  # metres, largest shift of a copied point by a lidar's noise
-_UNKNOWN = 1e4  # variance of a motion that cannot be registered
+_UNKNOWN = 1e4  # variance of a motion that cannot be registered, m2 and rad2
 
 
 class CloudMotion(NamedTuple):
@@ -54,7 +54,7 @@ class CloudMotion(NamedTuple):
     motion: Floats  # (3,) x, y, heading
     covariance: Floats  # (3, 3), wide along a tunnel
     fit: float  # share of the structure on the earlier surfaces
-    usual: float  # expected fit, by earlier motions and the structure on the scan's own surfaces
+    usual: float  # expected fit, by earlier motions and the share of structure on the scan's own surfaces
     surfaces: float  # number of the scan's points on its own surfaces
     T: Pose | None  # (4, 4) in the axes of the earlier body; None if registration fails
     same: float | None = None  # share of unmoved structure points, for a motion near zero
@@ -113,7 +113,7 @@ class CloudMotionMeter:
             usual = flat * (self._usual or 0.0)
             fit = fit_of(scan, target, odometry)
             unknown = CloudMotion(np.zeros(3), _UNKNOWN * np.eye(3), fit, usual, surfaces, None)
-            # None unless a registration's number of pairs would be possible
+            # clouds with too few surface points to register say nothing
             return unknown if unknown.misfit > APART and surfaces >= MIN_PAIRS else None
         if self._usual is None:
             self._usual = min(1.0, best[2] / max(flat, ALIKE))  # no surfaces fit a cloud better than its own

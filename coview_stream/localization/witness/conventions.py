@@ -39,11 +39,11 @@ HEADING, SCALE = math.radians(8.0), 0.12
 """Heading of the lidar on the body, radians, and error of odometry's scale that are no other convention."""
 SURE = math.log(99.0)
 """Log odds of a finding: agreement of two motions may be chance (1 in 48), that of three is not (1 in 340)."""
-STILL = 0.5  # metres
+STILL = 0.5  # metres; a robot that moves less is taken to stand
 BASELINE = 1.0  # metre between two clouds that are compared
 
 _FAILS = 0.1  # probability that a registration fails, as in the calibration
-METRES_PER_RADIAN = 5.0
+METRES_PER_RADIAN = 5.0  # of a misfit
 _SWAY = math.radians(0.3)  # sigma of a rotation about x or y: 0.2 each by registration and by odometry's level
 _FARTHEST = 300.0  # metres; above the median range of any lidar anywhere
 MILLIMETRE = 0.001  # metres
@@ -68,12 +68,12 @@ RIVALS: dict[str, Change] = {
 
 
 def _order_mended(T: Pose) -> Pose:
-    """Return a pose (4, 4) whose quaternion was written w, x, y, z and read x, y, z, w."""
+    """Correct a pose (4, 4) whose quaternion was written w, x, y, z and read x, y, z, w."""
     return pose_from(quat_to_matrix(quaternion_of(T)[[1, 2, 3, 0]]), T[:3, 3])
 
 
 def _heading_mended(T: Pose) -> Pose:
-    """Return a pose (4, 4) whose heading was counted from y towards x."""
+    """Correct a pose (4, 4) whose heading was counted from y towards x."""
     return pose_from(rot_z(math.pi / 2.0 - 2.0 * yaw_of(T)) @ T[:3, :3], T[:3, 3])
 
 
@@ -146,7 +146,7 @@ BOTH_CAMERA = Reading(
 
 
 def turning(start: Floats, end: Floats) -> Floats:
-    """Return the smallest rotation (3, 3) that takes one unit vector (3,) to another."""
+    """Return the smallest rotation (3, 3) that takes one unit vector (3,) to another; opposite ones have no x."""
     v, c = np.cross(start, end), float(start @ end)
     if c < -0.9999:
         return np.diag([1.0, -1.0, -1.0])
@@ -170,7 +170,7 @@ def _log_odds(gap: float, far: float, farther: float, sigma: float) -> float:
 
 
 def _gaussian(gap: float, sigma: float, farther: float) -> float:
-    """Return the likelihood ratio of a planar gap: within ``sigma``, against within ``farther`` in addition."""
+    """Return the likelihood ratio of a planar gap: of ``sigma`` alone, against ``sigma`` and ``farther`` together."""
     follows, unrelated = sigma**2, sigma**2 + farther**2
     return unrelated / follows * math.exp(0.5 * gap**2 * (1.0 / unrelated - 1.0 / follows))
 

@@ -15,7 +15,7 @@ three agree if nothing is wrong. Each fault makes them disagree in its own way:
 
 Each registration fails with a small probability and is then arbitrary. A hidden Markov model gives the probabilities:
 those before the step, moved by the rates at which faults start and end, times the likelihood of l and m (forward
-algorithm). Each lag on a grid is a state; each step starts a hypothesis about C, and the best are kept.
+algorithm). Each lag on a grid is a state; each step starts hypotheses about C, s and a clock's drift; the best stay.
 """
 
 from __future__ import annotations
@@ -45,7 +45,7 @@ from coview_stream.localization.witness.agreement import (
 _PER_SECOND = 1e-6  # a driver hangs, a clock drifts away, a second driver starts: once in twelve days of driving
 _PAUSE = 60.0  # seconds of a pause that count: drivers and clocks fail while they run or restart
 _PER_METRE = 1e-6  # a bolt gives way: once in 1000 km
-_FAST = 40.0  # metres per second; no robot is faster, but clouds that cannot be registered may be
+_FAST = 40.0  # metres per second; no robot is faster, though a wrong registration of clouds may say so
 _SLIPS = 0.01  # per metre: wheels slip once in 100 m
 _SLIPS_ON = 0.5  # probability that a slip lasts until the next step: wheels grip again within metres
 _STALLS = 1e-4  # share of holes in the stamps after which clouds are late by the hole: mostly clouds were dropped
@@ -56,7 +56,7 @@ LAGS = np.arange(0.0, 3.01, 0.05)
 """Lags of clouds, seconds; the first is zero, the last means "as long or longer"."""
 _FASTEST = 0.5  # seconds per second, fastest growth of a lag: a driver at half speed
 _ALONG, _SIDEWAYS = 0.3, 0.1  # share of the path: wheels that spin or lock, and that skid
-_SKID = np.array([0.1, 0.1, math.radians(3.0)])  # in addition, within a step
+_SKID = np.array([0.1, 0.1, math.radians(3.0)])  # in addition, within a step: metres, radians
 _JUMPS = ((0.08, 1.0), (0.015, 10.0), (0.005, 100.0))  # odometry may jump by anything, like a restarted estimator
 _SLIP_KINDS = (  # share, sigmas, and sigmas per metre of odometry
     (0.5, np.array([0.03, 0.03, math.radians(0.5)]), np.array([_ALONG, 0.0, 0.0])),  # all wheels, along the path
@@ -74,7 +74,7 @@ _CHANGES = (  # sigmas of C: a mount gives way, a frame with another origin, one
     np.array([0.1, 0.1, math.radians(100.0)]),
 )
 _SCALES = 0.5  # sigma of wrong scales of odometry: tyres, gears, units of half the size
-_KEPT = 5  # kept hypotheses about C, and about a scale
+_KEPT = 5  # kept hypotheses about each of C, scales and drifting clocks
 _EXACT = np.zeros((3, 3))
 _ON_BODY = 2.0  # metres, largest shift of a sensor on its mount
 _TURNED = math.radians(2.0)  # of C, from which it is called a turn
@@ -83,7 +83,7 @@ _NEGLIGIBLE = 1e-6  # probability below which a fault has not started
 
 @dataclass
 class _Moved:
-    """Hypothesis that clouds have been moved by C (3,) since a step."""
+    """Hypothesis that clouds have been moved by C (3,), a planar motion, with ``sigmas`` (3,), since a step."""
 
     weight: float
     C: Floats
@@ -175,10 +175,10 @@ class FaultPosterior:
     moved: list[_Moved] = field(default_factory=list)
     scaled: list[_Scaled] = field(default_factory=list)
     parting: list[_Parting] = field(default_factory=list)
-    astray: float = 0.0  # probability that odometry has gone wrong at some step since ``trusted``
+    astray: float = 0.0  # probability that odometry has gone wrong at some step since :meth:`trusted`
     _driven: float = 0.0  # metres by odometry since the scan has been repeated
     _moved_on: float = 0.0  # metres by the clouds since odometry has stood still
-    _speed: Floats = field(default_factory=lambda: np.zeros(3))  # of the newest step; includes the body's tilting
+    _speed: Floats = field(default_factory=lambda: np.zeros(3))  # of the newest step: m/s, m/s, rad/s with tilting
     _before: tuple[float, Floats, Floats] | None = None  # seconds, odometry and clouds of the previous step
 
     @property
@@ -193,13 +193,13 @@ class FaultPosterior:
 
     @property
     def slipped(self) -> float:
-        """Odds that odometry has gone wrong since ``trusted``, between a millionth and a million."""
+        """Odds that odometry has gone wrong since :meth:`trusted`, between a millionth and a million."""
         right = (1.0 - self.astray) * (1.0 - self.odometry)
         return max(1.0 - right, _NEGLIGIBLE) / max(right, _NEGLIGIBLE)
 
     @property
     def sensors(self) -> float:
-        """Probability of a present fault of the clouds, their stamps or odometry's."""
+        """Probability of a present fault of the clouds, their clock or mount, or of odometry that has stopped."""
         return 1.0 - self.good - self.odometry
 
     def add(self, step: Step) -> None:
@@ -218,7 +218,7 @@ class FaultPosterior:
         kinds = [(share, np.diag((sigmas + metre * driven) ** 2)) for share, sigmas, metre in _SLIP_KINDS]
         smoother = self._smoother(step)
         slips = smoother * sum(share * float(like(o, noise + spread)) for share, spread in kinds)
-        stands = driven < 3.0 * math.sqrt(float(noise[0, 0]))  # and sees copies
+        stands = driven < 3.0 * math.sqrt(float(noise[0, 0]))  # so copies look like true clouds
         copy = like(o) if stands else like(np.zeros(3)) * _copy_odds(step)
 
         # faults that start from the good state or a slip, continue and end
@@ -406,7 +406,7 @@ class FaultPosterior:
         return seen * share, np.diag(inertia**2) + covariance * share**2
 
     def _smoother(self, step: Step) -> float:
-        """Return the ratio by which the clouds' motion continues the previous step better than odometry's."""
+        """Return the likelihood ratio by which the clouds' motion is smoother than odometry's, since the last step."""
         if self._before is None or step.clouds is None:
             return 1.0
         exponent, (seconds, driven, seen) = 0.0, self._before
@@ -429,7 +429,7 @@ def _scale_density(scale: float) -> float:
 
 
 def _copy_odds(step: Step) -> float:
-    """Return the ratio by which copies explain the points of a step's clouds better than new clouds."""
+    """Return the likelihood ratio of a step's points, for copies of the earlier cloud against a new cloud."""
     if step.copied or step.same is None:
         return 1.0 / _COPY if step.copied else 1.0
     share = step.same * math.log(_SAME_POINTS / _SAME_BY_CHANCE)

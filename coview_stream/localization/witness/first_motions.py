@@ -102,9 +102,9 @@ class CloudPairs:
         self._clouds, self._motion, self._variance = 0, np.eye(4), 0.0
 
     def add(self, points: Points, T_odom_body: Pose) -> Pair | None:
-        """Add a cloud (N, 3), metres, and its odometry (4, 4); return the motion since the pair's first, if far enough.
+        """Add a cloud (N, 3), metres, and its odometry (4, 4); return the pair that it completes, if any.
 
-        Shorter motions are accumulated.
+        Motions add up to a metre, over eight clouds at most, or until odometry drives while the clouds stand still.
         """
         cloud, pair = voxelized(points, self._level, KeyframeConfig()), None
         found = None if self._target is None else self._registered(cloud, T_odom_body, self._target)
@@ -155,8 +155,8 @@ class CloudPairs:
 def starts(before: Pose, after: Pose, step: Pose) -> Iterator[Pose]:
     """Yield motions (4, 4) to start a registration from, a metre or more apart.
 
-    They are odometry's as sent and corrected, the previous one, none, and odometry's distance in all directions, for a
-    lidar of any heading.
+    They are odometry's motion as sent and corrected, the previous motion ``step``, none, and odometry's distance in six
+    directions, for a lidar of any heading.
     """
     odometry = inverse(before) @ after
     tried = [odometry, step, np.eye(4)]

@@ -40,14 +40,14 @@ from coview_stream.localization.witness.stamps import step_stamps
 
 _METRES, _SECONDS, _TURN = 1.0, 1.0, np.radians(10.0)  # step limits, whichever comes first
 _SHORTEST = 0.3  # least seconds of a step shorter than _FAR
-_FAR = 5.0  # metres
+_FAR = 5.0  # metres; a step this long is compared at once
 _MANY = 5  # frames of a step, to which one more makes little difference
 _RECENT = 3  # odometry frames that define the velocity
 _SHORT = 0.05  # seconds; closer stamps are of one moment
 _HISTORY = 600  # frames of odometry
-_HEADING = np.radians(1.0)  # sigma of the heading of the sensor on the body
+_HEADING = np.radians(1.0)  # least sigma of the heading of the sensor on the body
 _RISK = 1e-3  # of exceeding a protection level
-_JITTER = np.array([0.02, 0.02, np.radians(0.3)])  # sigma of odometry that stands still
+_JITTER = np.array([0.02, 0.02, np.radians(0.3)])  # sigmas of odometry that stands still, metres and radians
 
 
 class _Frame(NamedTuple):
@@ -56,7 +56,7 @@ class _Frame(NamedTuple):
     T_odom_raw: Pose
     path: Floats  # (3,) planar pose by odometry, corrected
     copied: bool  # it has the bytes of the previous frame
-    number: int
+    number: int  # in order of arrival
     on_map: Estimate | None = None
 
 
@@ -320,8 +320,8 @@ class Witness:
     def _by_lags(self, stamp: float) -> Floats:
         """Return odometry's planar poses (L, 3) by LAGS before a stamp.
 
-        Odometry stands still before the first frame and continues at its velocity after the newest. Within holes its
-        speed changes from the one before to the one after.
+        Odometry stands still before the first frame and continues at its velocity for a second after the newest. Within
+        holes its speed changes from the one before to the one after.
         """
         stamps = np.array([at for at, _ in self._path])
         poses = np.stack([pose for _, pose in self._path])

@@ -113,7 +113,7 @@ def real(seed: int = 0) -> Dirt:
 def parse_dirt(text: str, seed: int = 0) -> Dirt:
     """Parse a list of dirt such as ``rain,snow:0.4``; ``real`` is all kinds.
 
-    A number after a colon sets the kind's first setting; ``real,snow:0.1`` changes one of all kinds.
+    A number after a colon sets the kind's strength (:data:`STRENGTHS`); ``real,snow:0.1`` changes one of all kinds.
 
     Raises:
         ConfigError: an unknown kind, a word for a number, or a number out of its range.

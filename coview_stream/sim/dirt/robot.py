@@ -188,7 +188,7 @@ class Track:
         return Segment(np.rint(stamps * _NS).astype(np.int64), self.odom(stamps))
 
     def straightened(self, frame: int, points: Points, times: Floats, rate: float) -> Points:
-        """Deskew a sweep's points (N, 3) by odometry, as a node does."""
+        """Deskew a sweep's points (N, 3) by odometry, as a node does, each in the body frame at its time (N,)."""
         stamp_ns = round(float(self.stamps[frame]) * _NS)
         return deskew(points, times, self.segment(frame, rate), stamp_ns, self.odometry[frame])
 

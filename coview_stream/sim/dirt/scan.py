@@ -114,7 +114,7 @@ class Surfaces:
         self._caster = MeshCaster(meshes, {LEAVES: None})
 
     def echoes(self, origins: Floats32, rays: Floats32, rng: np.random.Generator) -> Echoes:
-        """Cast (N, 3) unit rays from (N, 3) origins, scene frame, metres."""
+        """Return the echoes of unit rays (N, 3) from origins (N, 3), scene frame, metres."""
         hits = self._caster.trace(origins, rays, rng, POROSITY)
         distance, strength = hits.distance.astype(np.float64), hits.incidence.astype(np.float64)
         if self._cover is not None:
@@ -158,7 +158,7 @@ class Scanner:
         rng: Callable[[Stream], np.random.Generator],
         mount: Mount = Mount(),  # noqa: B008 - immutable
     ) -> None:
-        """Take the present scene; ``rng`` gives the random numbers of a purpose, ``height`` is the sensor's."""
+        """Take the present scene; ``rng`` gives a purpose's random numbers, ``height`` is the body's above ground."""
         self._sensor, self._dirt, self._height, self._mount = sensor, dirt, height, mount
         covered = dirt.snow is not None or dirt.grass is not None
         cover = Cover(scene.site, dirt.snow, dirt.grass, rng(Stream.COVER)) if covered else None
@@ -239,7 +239,7 @@ class Scanner:
         return Echoes(distance, np.where(nearer, met.incidence, surfaces.strength), surfaces.signs & ~nearer)
 
     def _weather(self, echoes: Echoes, rays: Floats) -> Floats:
-        """Return the range (N,) of the nearest surface, drop or dust; drops and dust always return."""
+        """Return the range (N,) of the nearest surface, drop or dust; drops and dust get full strength."""
         distance = echoes.distance
         in_air = np.full(len(rays), np.inf)
         if self._dirt.rain is not None:

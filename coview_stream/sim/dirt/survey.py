@@ -19,8 +19,8 @@ _UPRIGHT = 0.5  # share of a strip's error that may be vertical
 class Strips:
     """Misalignment of whole strips of a survey, zero on average."""
 
-    least: float = 0.05  # least root mean square distance by which two strips disagree, metres; drawn uniformly
-    most: float = 0.15  # greatest
+    least: float = 0.05  # least root mean square distance between the offsets of two strips, metres
+    most: float = 0.15  # greatest; the distance is drawn uniformly between the two
 
     def __post_init__(self) -> None:
         within(self, least=(0.0, 5.0), most=(0.0, 5.0))

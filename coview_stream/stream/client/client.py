@@ -26,7 +26,7 @@ from coview_stream.stream.transport.zenoh_transport import open_client
 
 _log = logging.getLogger(__name__)
 
-MAX_UNREAD_POSES = 100  # ten seconds of poses; the same for statuses
+MAX_UNREAD_POSES = 100  # ten seconds of poses at 10 Hz; as many statuses are kept
 
 
 class RobotClient:
@@ -161,7 +161,7 @@ class RobotClient:
         return self._transport.await_subscriber(self._sender.cloud_key, seconds)
 
     def relocalize(self, timeout: float = 5.0) -> dict[str, Any]:
-        """Make the node forget the pose and search again; return its reply.
+        """Make the node forget the place and search the whole map again; return its reply.
 
         Raises:
             TransportError: no answer within ``timeout`` seconds, the node refused, or the client is closed.

@@ -17,11 +17,11 @@ WINDOW = 5.0  # seconds over which the rate of poses is measured
 STALE = 2.0  # seconds without a pose after which the last pose is no longer shown
 SILENT = 5.0  # seconds without any message: a node sends one each second
 MAX_ROBOTS = 1000  # beyond it the robots heard least recently are forgotten: strangers may choose names
-_LEAST = 1e-6  # smaller probabilities of a wrong place are only shown as below this: columns are narrow
+_LEAST = 1e-6  # a smaller probability of a wrong place is shown as "less than" this: columns are narrow
 
 _INDENT = " " * 4  # of a reason below its robot's line
 
-_COLUMNS = (
+_COLUMNS = (  # title and width, characters; negative: aligned to the left
     ("robot", -12),
     ("state", -12),
     ("x", 12),

@@ -126,12 +126,12 @@ _SILENT = 3.0  # seconds: a node reports its health once a second
 def await_engines(
     transport: Transport, base: str, robot: str, seconds: float, wait: Callable[[float], object] = time.sleep
 ) -> bool:
-    """Wait up to ``seconds`` until a node that serves the robot reports ready engines; False if none does.
+    """Wait up to ``seconds`` until a node that serves the robot reports ready engines; False if those heard do not.
 
-    If no node reports its health for three seconds, another program has subscribed, and the wait ends. ``wait`` as in
-    :meth:`Transport.await_subscriber`; if it ends the wait, the result is True.
+    True after three seconds without the health of such a node, because then another program has subscribed. ``wait`` as
+    in :meth:`Transport.await_subscriber`; if it ends the wait, the result is True.
     """
-    told = dict[str, bool]()  # by key, for the nodes that serve the robot
+    told = dict[str, bool]()  # whether ready, by key, for the nodes that serve the robot
 
     def hear(sample: Sample) -> None:
         document = read_object(sample.payload)
@@ -177,7 +177,7 @@ class ReplayReport:
     damaged: int = 0  # frames not sent: unreadable, or without a finite point
     first_error: CloudError | None = None  # among the damaged frames
     seconds: float = 0.0  # from the first message to the last
-    # milliseconds to publish each cloud, and delay of each sample after its deadline
+    # milliseconds to publish each cloud, and after its deadline until each sample was sent
     put_ms: deque[float] = field(default_factory=lambda: deque(maxlen=_MAX_MEASUREMENTS))
     late_ms: deque[float] = field(default_factory=lambda: deque(maxlen=_MAX_MEASUREMENTS))
     finished: bool = False  # False if it ended before its last frame
@@ -205,7 +205,7 @@ class ReplayReport:
 
 @dataclass(frozen=True)
 class _EncodedSample:
-    """A scheduled sample with its encoded messages; ``error`` replaces a damaged cloud."""
+    """A scheduled sample with its encoded messages; ``error`` says why a damaged cloud is missing."""
 
     due: float
     odometry: Encoded | None

@@ -25,8 +25,8 @@ log = logging.getLogger("coview_stream.maps")
 MAP_SERVER_ENDPOINT = "tcp/127.0.0.1:7448"
 """Default endpoint of ``serve-map`` and ``zenoh://SITE``."""
 
-_NICE = 10
-_LOOK = 0.1  # seconds
+_NICE = 10  # niceness of the process that prepares a map
+_LOOK = 0.1  # seconds between checks whether it is still wanted
 
 
 def source_of(
@@ -130,7 +130,7 @@ def prepare_map(place: Path, cancelled: Callable[[], bool]) -> None:
 
 
 def main() -> None:
-    """Open the map named on the command line."""
+    """Load the map named on the command line, which writes its working file."""
     from coview_stream.basemap.joined import load_map
 
     with contextlib.suppress(OSError, AttributeError):

@@ -21,14 +21,14 @@ PERIOD = 10.0
 _LOOK = 1.0  # seconds between checks of a change's outcome
 _MOST_DOUBLINGS = 5  # of the time to the next try or request
 _HOUR = 3600.0  # seconds over which changes are counted: each doubles the time between requests
-_SETTLED = ("changed", "unchanged")
+_SETTLED = ("changed", "unchanged")  # outcomes of a change that is over
 
 
 class MapFollower:
     """Asks the sources of mirrored sites for changes, on its own thread.
 
     Attributes:
-        last: ``address``, ``result`` (``current``, ``fetched``, ``unreachable`` or ``refused``) and ``error``.
+        last: outcome: ``address``, ``result`` (``current``, ``fetched``, ``unreachable`` or ``refused``), ``error``.
     """
 
     def __init__(

@@ -89,7 +89,7 @@ class ErrorLog:
                 log.warning("%s", text)
 
     def clear(self) -> None:
-        """Forget all errors, as they are over: the next error of a kind is its first again."""
+        """Forget all errors, as they are over; the next one of a kind is shown again, but not logged again."""
         self.texts.clear()
 
     def add_first(self, kind: str, text: str) -> None:

@@ -1,7 +1,7 @@
 """An engine in its own process, which is restarted when it dies and killed when it hangs.
 
 Native code (registration, BLAS, tree building) may hold the interpreter lock for long, so only a separate process keeps
-the node's pose clock steady. Its command is ``python -m coview_stream.stream.node.engine_process FD KIND PARENT``.
+the node's pose clock steady. It is started by ``python -m coview_stream.stream.node.engine_process FD KIND PARENT``.
 """
 
 from __future__ import annotations
@@ -43,7 +43,7 @@ NICE = {"odometry": 2, "track": 4, "search": 10}
 _POLL_INTERVAL = 0.1  # seconds between checks whether the opening was cancelled
 _PARENT_INTERVAL = 2.0  # seconds between an idle child's checks that its parent lives
 _DOUBT = ("doubt", None)  # message sent during a job
-_REST = 3  # idle checks of the parent before memory is freed: a robot in search sends a keyframe every few seconds
+_REST = 3  # idle checks before memory is freed, 6 s: while a robot is searched for, a keyframe comes every few seconds
 
 
 class RejectedError(Exception):
@@ -154,7 +154,7 @@ class EngineProcess:
         self._awaited: list[str] = []  # messages that a fresh child has yet to send
         self._step: str | None = None  # newest step of the child's start
         self._stopped: int | None = None  # id of the process that the previous check found stopped
-        self._deadline = float("inf")  # local time at which the present job counts as hung
+        self._deadline = float("inf")  # local time at which the present exchange with the child counts as hung
         self._hung = False
 
     @property

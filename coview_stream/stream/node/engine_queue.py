@@ -42,7 +42,7 @@ class FrameJob:
     hint: Pose | None = None
     guess: PlaceGuess | None = None  # guess of the place; tried, never trusted
     calibration: Calibration | None = None  # of sensor and odometry at ``hint``, a prior
-    # the first epoch since a client reset the robot; another one makes the engine forget the calibration too
+    # the first epoch since the robot was reset; another one makes the engine forget the calibration too
     first_epoch: int = 0
 
 
@@ -143,7 +143,7 @@ class PlaceHints:
         return self.T_map_body if self._pending else None
 
     def offer(self, T_map_body: Pose, calibration: Calibration | None) -> None:
-        """Take a pose from before this session, which the engine does not know."""
+        """Take a pose that the engine does not know, as from before this session, and its calibration."""
         self.T_map_body, self.calibration, self._pending = T_map_body, calibration, True
 
     def offer_guess(self, guess: PlaceGuess | None) -> None:

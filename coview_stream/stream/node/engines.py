@@ -34,8 +34,8 @@ class Engine(ABC):
     """Works through jobs one at a time; an exception affects the job's robot only.
 
     Attributes:
-        kernels: kernels of its first jobs, compiled beforehand.
-        later_kernels: kernels of later jobs only, compiled between jobs.
+        kernels: kernels of its first jobs, loaded (if need be compiled) before these.
+        later_kernels: kernels of later jobs only, loaded in the pauses between jobs.
         on_doubt: called during a job if its frame contradicts the robot's place.
     """
 
@@ -167,7 +167,7 @@ class SearchEngine(Engine):
 
 
 class OdometryEngine(Engine):
-    """One :class:`LidarOdometry` and ``registration`` per robot; DependencyError, with remedy, without kiss-icp."""
+    """Lidar odometry: each robot has its own, with its own ``registration``; DependencyError without kiss-icp."""
 
     def __init__(self, registration: Callable[[LidarOdometryConfig], ScanRegistration] = KissRegistration) -> None:
         self._registration = registration

@@ -100,6 +100,7 @@ class Fleet:
     """One node's part in a fleet, on its own thread: it takes robots on and gives them up.
 
     Args:
+        prefix: first part of the fleet's keys.
         node: name of this node, unique in the fleet.
         endpoints: endpoints of all robots of the fleet, by name; none is served yet.
         ready: whether this node's engines are ready.

@@ -189,7 +189,7 @@ def _memory(pid: int) -> int | None:
 
 
 class Notifier:
-    """Sends notices to systemd; never waits or fails. ``watchdog_period`` is half of its limit, seconds, or None."""
+    """Sends notices to systemd; never waits or fails. ``watchdog_period``: half of systemd's limit, s, or None."""
 
     def __init__(self, environment: Mapping[str, str] = os.environ) -> None:
         address = environment.get("NOTIFY_SOCKET", "")

@@ -292,7 +292,7 @@ class Inputs:
         return "no frame has been processed yet"
 
     def silent(self, now: float) -> str:
-        """Return the inputs that have not come for ``max_outage``, and since when; empty if none."""
+        """Return which inputs repeat their stamps or have not come for ``max_outage``, and how long; empty if none."""
         arrived = {"clouds": self._newest["clouds"].came_at}
         if self.odometry_source == "robot":
             arrived["odometry"] = self.odometry.arrived
@@ -306,7 +306,7 @@ class Inputs:
         return " and ".join(f"{name} {_COMES[name]} {text}" for name, text in stands.items() if text)
 
     def silence_reason(self, now: float) -> str:
-        """Return why there is no odometry."""
+        """Return why no odometry has come for ``odometry_timeout``."""
         return self.repeating(now) or f"no odometry for {self.config.odometry_timeout:g} s"
 
 
@@ -314,7 +314,7 @@ class LidarInputs(Inputs):
     """Inputs of a robot that sends only clouds: lidar odometry finds a pose for each cloud, which is paired with it.
 
     Frames go to the odometry engine in order of their stamps; one is under way, and at most two wait. An
-    :class:`OdometryBuffer` finds stray stamps, pauses and restarted clocks, from stamps alone. Whenever lidar odometry
+    :class:`OdometryBuffer` of their stamps finds repeated and stray ones, and restarted clocks. Whenever lidar odometry
     restarts, so does the search, as the motion in between is unknown. ``epoch`` is the id of the first
     lidar odometry, which no earlier job of this robot has had.
     """

@@ -33,7 +33,7 @@ from coview_stream.messages.types import Sample
 
 log = logging.getLogger(__name__)
 
-VERSION = 1
+VERSION = 1  # of the file's format
 
 _FORMAT = "coview_stream last pose"
 _MAX_BYTES = 65_536  # of a file; ours have about 500
@@ -174,7 +174,7 @@ def _open_regular(path: Path) -> BinaryIO:
 def guess_of_fields(given: Mapping[str, Any]) -> PlaceGuess:
     """Return the guess in named numbers or their texts: x and y, perhaps yaw, distance and angle (radians, metres).
 
-    ``map`` names the map whose frame they are in; a single map is ``map``. ``within``: as in :class:`PlaceGuess`.
+    ``map`` names the map in whose frame they are; a lone map is called ``map``. ``within``: as in :class:`PlaceGuess`.
     InputError if x or y is missing, a name is unknown, or a value is not a number or out of range.
     """
     unknown = sorted(set(given) - set(_GUESS_FIELDS))

@@ -143,7 +143,7 @@ class RobotEndpoints:
         return self._answer()
 
     def suggest(self, parameters: dict[str, str]) -> dict[str, Any]:
-        """Answer ``rpc/suggest``; an InputError, sent as the reply, if the guess names no place."""
+        """Answer ``rpc/suggest``; InputError, which is sent as the reply, if ``parameters`` are no guess."""
         guess, notes = guess_of_fields(parameters), []
         for session in self._sessions:
             try:

@@ -1,4 +1,4 @@
-"""State of one robot as its node publishes it: the engine's state with the session's vetoes."""
+"""State of one robot as its node publishes it: the engine's, or LOST or DOUBTED where the session withholds poses."""
 
 from __future__ import annotations
 

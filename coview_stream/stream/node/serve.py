@@ -44,7 +44,7 @@ class NetworkOptions:
     listen: Sequence[str] = ()
     zenoh_config: Path | None = None
     ros2: Any = None  # from :func:`~coview_stream.stream.transport.ros2_node.start_node`
-    check_frames: bool = True  # for ROS 2: refuse clouds in another frame than that of the odometry's body
+    check_frames: bool = True  # for ROS 2: refuse clouds in a frame that /tf_static does not join to odometry's body
 
 
 @dataclass(frozen=True)

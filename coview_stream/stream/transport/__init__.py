@@ -1,1 +1,1 @@
-"""Zenoh sessions, keys and queries; the in-memory transport for tests."""
+"""Transports (zenoh, ROS 2, and in memory for tests), their keys and queries, and the HTTP server."""

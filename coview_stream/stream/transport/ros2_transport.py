@@ -47,10 +47,10 @@ _MAP_TOPIC, _GUESS_TOPIC = "map_points", "initialpose"  # relative: a namespace 
 
 @dataclass
 class _Robot:
-    """A robot's topics and frames. ``check_frames``: clouds must be in the frame of the odometry's body."""
+    """A robot's topics and frames. ``check_frames``: /tf_static must join a cloud's frame to the odometry's body."""
 
     keys: RobotKeys
-    prefix: str  # of topics that a single robot has in the node's namespace; empty with one robot
+    prefix: str  # of its topics tf, tf_static and initialpose; empty if it is the only robot
     check_frames: bool
     map_frame: str = "map"
     odometry_frame: str = ""  # of the newest odometry

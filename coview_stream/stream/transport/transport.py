@@ -1,4 +1,4 @@
-"""Network interface of nodes and clients; zenoh implements it, and an in-memory transport for tests."""
+"""Network interface of nodes and clients; implemented for zenoh, for ROS 2, and in memory for tests."""
 
 from __future__ import annotations
 
@@ -13,12 +13,12 @@ MAX_REPLY = 64 * 1024
 """Largest reply to a query, bytes, unless the caller allows more."""
 
 Policy = Literal["newest", "all"]
-"""``newest``: a slow reader sees only the newest sample (a ring of one). ``all``: every sample, in order."""
+"""``newest``: a slow reader sees only the newest sample. ``all``: it sees all in order, but of too many the newest."""
 
 Urgency = Literal["realtime", "data", "report", "bulk"]
-"""``realtime``: small and urgent (poses): express, never waits. ``data``: must arrive (odometry): blocks rather than
-drops. ``report``: statuses: a stopped reader misses some and blocks no other reader. ``bulk``: clouds: only the newest
-frame matters, one that does not fit is dropped."""
+"""``realtime``: small and urgent (poses): express, never waits. ``data``: must arrive (odometry): waits for a
+busy link in a bounded queue. ``report``: statuses: a stopped reader misses some and blocks no other reader. ``bulk``:
+clouds: only the newest frame matters, one that does not fit is dropped."""
 
 
 class Publisher(Protocol):
@@ -35,7 +35,7 @@ class Publisher(Protocol):
 
 @dataclass(frozen=True)
 class Connection:
-    """Zenoh identities of the connected routers and peers, sorted."""
+    """Connected routers and peers, sorted: zenoh identities, or names of ROS 2 nodes."""
 
     routers: tuple[str, ...] = ()
     peers: tuple[str, ...] = ()  # all others; clients of a listening session count as peers

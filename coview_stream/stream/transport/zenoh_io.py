@@ -1,4 +1,4 @@
-"""Conversion of samples and queries between zenoh's types and ours, and their quality of service."""
+"""Conversion of samples and queries between zenoh's types and ours, quality of service, and queues of both ways."""
 
 from __future__ import annotations
 
@@ -141,7 +141,7 @@ def plain(sample: Any, max_payload: int | None = None) -> Sample:
 
 
 def quality(urgency: Urgency) -> dict[str, Any]:
-    """Return the options for declaring a publisher."""
+    """Return the options with which zenoh declares a publisher of this urgency."""
     import zenoh
 
     congestion, priority = zenoh.CongestionControl, zenoh.Priority
@@ -253,7 +253,7 @@ THREADS = 4
 
 
 MAX_INBOX = 1 << 27
-"""Bytes of samples that may wait on one subscription, besides the newest: two of the largest."""
+"""Bytes of samples that may wait on one subscription, besides the newest: two of the largest (64 MiB each)."""
 
 
 def size_of(sample: Any) -> int:

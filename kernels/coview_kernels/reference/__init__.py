@@ -1,7 +1,7 @@
-"""NumPy twins of the kernels, with the same names and signatures.
+"""NumPy twins of the kernels.
 
 They are the oracle of the tests, and the implementation if Taichi has no wheel or ``COVIEW_KERNELS=numpy`` is set.
-The public functions of :mod:`coview_kernels` check the arguments.
+The public functions of :mod:`coview_kernels` check the arguments, and pass them in the form that the kernel takes.
 """
 
 from __future__ import annotations

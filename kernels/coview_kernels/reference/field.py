@@ -8,7 +8,7 @@ import numpy as np
 
 from coview_kernels.arrays import F32, F64, I32, I64, U16, Mask
 
-CELL, TILE = 0.5, 32
+CELL, TILE = 0.5, 32  # metres along a cell's edge; cells along a tile's
 NO_GROUND, NOT_SURVEYED = -32768, -32767
 """Values of the ground raster without a height."""
 

@@ -159,9 +159,9 @@ class FeatureMatcher:
         return FeatureVote(query.centre, self.rasters.fine, self.cells, turned.images, candidates, groups)
 
     def _named(self, coarse: Floats32, turned: TurnedQuery) -> tuple[tuple[Ints, Ints], Ints]:
-        """Return stations and shifts (N,) in and around the best coarse cells and headings (2 K, H, W).
+        """Return stations and shifts (N,) in the cells and about the headings of the best scores (2 K, H, W).
 
-        A cell counts once per half turn, with its best heading. The second array (N,) numbers cells and half turns.
+        A cell counts once per half turn, with its best heading. The last array (N,) numbers cells and half turns.
         """
         order, begin = self._by_coarse_cell
         halves = coarse.reshape(2, len(turned.headings), -1)
