@@ -7,7 +7,7 @@ benchmark with the modules that it imports. Quick runs have tables of their own.
 ``python -m bench release --work DIR [--only NAME...] [--quick]`` makes a page of one product, for a release. The page
 is its memory: a table that is there, of both hashes and by the same command, is done, and one that is made goes into it
 at once. So a release continues in another DIR or on another machine while the product's hash is the same (comments,
-docstrings and layout do not count, nor the picture of a map; it is one minor version of Python's), and a mended
+docstrings and layout do not count, nor :data:`UNMEASURED` code; it is one minor version of Python's), and a mended
 benchmark repeats only its own tables. Remove the file of the kept runs of ``integrity`` when the product has changed.
 The most valuable tables come first. Those without times run side by side, one on each core, the others alone; most keep
 the results of each drive or site in ``DIR/worlds`` as well, so that an interruption costs minutes (``soak``, an hour in
@@ -44,7 +44,8 @@ from coview_stream.clouds.atomic_file import atomic_path
 from coview_stream.errors import InputError
 
 PAGE = ROOT / "docs" / "results.md"
-_PICTURE = Path("coview_stream/report/relief.py")  # of a map; no benchmark draws it
+UNMEASURED = ("report/relief.py", "viewers", "stream/transport/ros2_transport.py")
+"""Parts of the package that no benchmark runs: the picture of a map, views, ROS 2 in place of zenoh."""
 
 
 class Table(NamedTuple):
@@ -370,9 +371,11 @@ def introduction(page: str) -> str:
 
 
 def _code() -> str:
-    """Short hash of the product and the kernels, but for :data:`_PICTURE`."""
-    product = (file.relative_to(ROOT) for file in sorted((ROOT / _PICTURE.parts[0]).rglob("*")) if file.is_file())
-    return fingerprint(*(str(file) for file in product if file != _PICTURE), "coview_kernels")
+    """Short hash of the product and the kernels, but for :data:`UNMEASURED`."""
+    package = ROOT / "coview_stream"
+    files = (str(file.relative_to(package)) for file in sorted(package.rglob("*")) if file.is_file())
+    measured = (f"coview_stream/{file}" for file in files if not file.startswith(UNMEASURED))
+    return fingerprint(*measured, "coview_kernels")
 
 
 def _made_by(name: str) -> str:
