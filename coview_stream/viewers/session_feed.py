@@ -110,7 +110,7 @@ class SessionFeed:
         map_view: map to show from the start; None: none.
         map_source: called with a robot's name when its status names an unknown map; None: no further map.
         clouds: whether to subscribe to clouds, most of the traffic.
-        mount: pose of the lidars on their robots, as in ``serve --mount``.
+        mount: pose of the lidars on their robots, as in ``serve --mount``, where a cloud comes without its own.
         policy: of the subscriptions except to clouds, which are ``newest``; ``newest`` in the node's own process.
     """
 
@@ -279,7 +279,7 @@ class SessionFeed:
                 continue
             points = message.points[np.isfinite(message.points).all(axis=1)]
             points = points[:: max(1, -(-len(points) // _SCAN_POINTS))]
-            points = np.array(self._mount.to_body(points), dtype=np.float32)
+            points = np.array((sample.mount or self._mount).to_body(points), dtype=np.float32)
             self._pending[robot] = now + _POSE_WAIT, Scan(robot, message.stamp_ns, points, None)
         for robot, (until, scan) in list(self._pending.items()):
             track = self._tracks.get(robot)

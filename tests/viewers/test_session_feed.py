@@ -2,6 +2,7 @@
 
 import json
 import threading
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -143,7 +144,10 @@ def test_a_scan_comes_with_the_pose_of_its_time_and_mounted(net, kept):
             put(net, KEYS.pose, encode_pose(pose_at(seconds, x), "json"))
         net.publish(cloud(0.1, points))
         (scan,) = kept.wait("scan")
+        net.publish(replace(cloud(0.15, points), mount=Mount(x=1.0)))  # by /tf_static
+        mounted = kept.wait("scan", 2)[1]
     assert np.allclose(scan.points, [[-1.0, -2.0, 3.0]], atol=1e-5)
+    assert np.allclose(mounted.points, [[2.0, 2.0, 3.0]], atol=1e-5)
     assert np.allclose(scan.T_map_body[:3, 3], [1.0, 0.0, 0.0], atol=1e-6)
 
 

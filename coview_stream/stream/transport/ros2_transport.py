@@ -365,7 +365,8 @@ class Ros2Transport:
             if robot.odometry_ns is not None:
                 if pose.stamp_ns > robot.odometry_ns:
                     return  # from before the sender restarted
-                robot.odometry_ns = pose.stamp_ns  # forgets a stray stamp far ahead
+                # forgets a stray stamp far ahead, but not odometry that came after this pose was made
+                robot.odometry_ns = max(pose.stamp_ns, robot.heard_ns or pose.stamp_ns)
             robot.T_map_odom, robot.map_frame, robot.posed_at = pose.T_map_odom, pose.frame_id, time.monotonic()
         robot.outputs["pose"].publish(ros2.encode_pose(pose).payload)
 

@@ -151,7 +151,7 @@ export class View {
     if (followed?.pose) [this.camera.x, this.camera.y] = [followed.pose.x, followed.pose.y];
     this.drawBase(context);
     const robots = [...this.session.robots.values()];
-    if (this.show.trail) for (const robot of robots) this.drawTrail(context, robot);
+    if (this.show.trail) for (const robot of robots) this.drawTrail(context, robot, now);
     if (this.show.scan) for (const robot of robots) this.drawScan(context, robot, now);
     if (this.show.hypotheses) for (const robot of robots) this.drawHypotheses(context, robot, now);
     const drawn = {};

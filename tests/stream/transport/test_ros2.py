@@ -272,6 +272,17 @@ def test_transform_follows_the_pose_freezes_while_lost_and_ends_with_the_senders
     site.told(robot, lambda: robot.values()["map -> odom"].startswith("none"))
 
 
+@pytest.mark.slow
+def test_a_pose_older_than_the_newest_odometry_does_not_hold_back_the_next(robot, site):
+    drive(robot, site, 0.0)
+    older = encode_pose(site.sessions["r1"].pose(), "json")
+    robot.move(ns(0.05), message(0.05).T_odom_body)
+    robot.until(lambda: site.sessions["r1"].inputs.odometry.newest.stamp_ns == ns(0.05))
+    site.net.publisher(KEYS.pose, "pose").put(older)
+    site.node.publish_poses(time.monotonic())
+    robot.until(lambda: any(stamp_of(pose) == ns(0.05) for pose in robot.poses))
+
+
 def transform(message):
     (row,) = message.transforms
     t, q = row.transform.translation, row.transform.rotation
