@@ -358,7 +358,7 @@ class StationGrid:
         return len(self.stations)
 
     def at(self, positions: Reals) -> Indices:
-        """Return the station (N,) in each position's cell, (N, 3), or -1; of several levels the nearest in 2.5 m."""
+        """Return the station (N,) in the cell of each position (N, 3), -1 for none; of levels the nearest in 2.5 m."""
         cell = self.cell(positions)
         if self._single is not None:
             return np.asarray(self._single.take(cell), dtype=np.intp)

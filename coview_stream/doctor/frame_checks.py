@@ -158,7 +158,7 @@ def _middle(directions: Floats) -> tuple[Floats, float]:
 
 
 def _pairs(frames: Sequence[SeenFrame], ground: _Ground | None) -> tuple[list[Pair], str]:
-    """Return the lidar's motions between frames a metre or more apart, with odometry, and any missing library."""
+    """Return the lidar's motions, mostly over a metre or more, with odometry's, and any missing library."""
     if ground is None:
         return [], ""
     try:

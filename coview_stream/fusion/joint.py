@@ -38,7 +38,7 @@ _MAP_WORSE, _MAP_ROUNDING = 1.05, 0.002  # factor and metres by which the distan
 
 @dataclass(frozen=True)
 class Judgement:
-    """Distances between surfaces before and after the adjustment, means over medians, metres; NaN if there are none."""
+    """Distances between surfaces before and after, metres: the mean of the pairs' or submaps' medians; NaN for none."""
 
     runs: tuple[float, float]  # between held-out submaps
     to_map: tuple[float, float]  # between submaps and the base map

@@ -34,7 +34,7 @@ def deskew(
 
     Args:
         points: (N, 3) float32, each in the body frame at its own time, metres.
-        times: (N,) seconds after ``stamp_ns`` (negative before), NaN for 0; outside the segment its nearest end counts.
+        times: (N,) seconds after ``stamp_ns`` (negative before); NaN is 0, and outside the segment its nearer end.
         segment: odometry that covers the sweep; with fewer than two samples nothing moves.
         stamp_ns: the frame's stamp.
         T_odom_body: (4, 4) odometry at that stamp.

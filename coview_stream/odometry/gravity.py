@@ -112,7 +112,7 @@ def gravity_from_walls(points: Reals, up: Floats) -> tuple[Floats, int]:
 
 
 def wall_evidence(points: Reals, up: Floats, sigma: float) -> tuple[Floats, Floats, int]:
-    """Return ``up``, of ``sigma`` radians, corrected by walls, their information (3, 3), 1 / rad^2, and number."""
+    """Return ``up`` (sigma in radians) corrected by walls, their information (3, 3), 1 / rad^2, and their number."""
     normals = _patches(points[:: 1 + len(points) // _WALL_POINTS].astype(np.float64), up)
     better, walls = up, np.zeros((3, 3))
     for _ in range(_WALL_ROUNDS):

@@ -111,7 +111,8 @@ class SessionFeed:
         map_source: called with a robot's name when its status names an unknown map; None: no further map.
         clouds: whether to subscribe to clouds, most of the traffic.
         mount: pose of the lidars on their robots, as in ``serve --mount``, where a cloud comes without its own.
-        policy: of the subscriptions except to clouds, which are ``newest``; ``newest`` in the node's own process.
+        policy: of all subscriptions but those to clouds, which always take ``newest``; give ``newest`` in the node's
+            own process, so that a full queue cannot block the node.
     """
 
     def __init__(

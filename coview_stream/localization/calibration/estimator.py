@@ -452,7 +452,8 @@ class CalibrationEstimator:
             T_map_body: (4, 4) later pose, likewise.
             step: (4, 4) odometry between them, corrected by the calibration of its time; below 0.2 m and 5 degrees it
                 shows nothing.
-            noise: (3, 3) covariance of the motion's (x, y, heading), body's axes at its start, but for the calibration.
+            noise: (3, 3) covariance of the motion's (x, y, heading), body's axes at its start, without the
+                calibration's errors.
             moments: of both poses; without them the motion shows no delay. A motion with unknown rates (NaN) is not
                 used: a robot that starts to move looks as if its clouds were late.
             contradicts: the motion contradicts odometry, perhaps by a slip, so it shows nothing of mount and clock.

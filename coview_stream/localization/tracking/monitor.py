@@ -80,7 +80,7 @@ _AT_ONCE = (
 
 @dataclass(frozen=True)
 class MatchVerdict:
-    """Verdict on one registration; if that failed or was not tried, the innovation and perhaps more is None."""
+    """Verdict on one registration. If it failed, there is no innovation; if none was tried, also no evidence."""
 
     cause: RejectionReason  # of the decision
     reason: str  # one clause for people

@@ -191,7 +191,7 @@ class OdometryTracker:
         return inverse(self._keyframe.T_odom_body) @ T_odom_body
 
     def change(self) -> Floats:
-        """Return the derivative (3,) by the clouds' delay of the motion since the newest keyframe: x, y, yaw there."""
+        """Return the derivative (3,) of the motion (x, y, yaw) since the newest keyframe by the clouds' delay."""
         motion = np.eye(4) if self.pose is None else self.motion(self.pose)
         return np.asarray(motion_jacobian(motion, np.array([_rates(self._keyframe.moment), self.rates]))[:, 2])
 

@@ -158,5 +158,5 @@ def unsure(step: Step) -> Floats | None:
 
 
 def hidden_by(seconds: Floats) -> Floats:
-    """Covariance (..., 3, 3) of motions by accelerations hidden from odometry, ``seconds`` (...) in seconds^2."""
+    """Covariance (..., 3, 3) of motions by accelerations that odometry missed; ``seconds`` (...) is in seconds^2."""
     return np.asarray(np.square(seconds)[..., None, None] * np.diag(_ACCELERATIONS**2))

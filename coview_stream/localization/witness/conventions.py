@@ -146,7 +146,7 @@ BOTH_CAMERA = Reading(
 
 
 def turning(start: Floats, end: Floats) -> Floats:
-    """Return the smallest rotation (3, 3) that takes one unit vector (3,) to another; opposite ones have no x."""
+    """Return the smallest rotation (3, 3) from a unit vector (3,) to another; for opposite ones half a turn about x."""
     v, c = np.cross(start, end), float(start @ end)
     if c < -0.9999:
         return np.diag([1.0, -1.0, -1.0])

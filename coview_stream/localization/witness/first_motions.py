@@ -104,7 +104,8 @@ class CloudPairs:
     def add(self, points: Points, T_odom_body: Pose) -> Pair | None:
         """Add a cloud (N, 3), metres, and its odometry (4, 4); return the pair that it completes, if any.
 
-        Motions add up to a metre, over eight clouds at most, or until odometry drives while the clouds stand still.
+        Motions are joined until they exceed a metre, over eight clouds at most, or until odometry drives while the
+        clouds stand still.
         """
         cloud, pair = voxelized(points, self._level, KeyframeConfig()), None
         found = None if self._target is None else self._registered(cloud, T_odom_body, self._target)

@@ -16,7 +16,7 @@ _LARGE = 1 << 18  # bytes: a larger piece is mapped, and unmapped when freed; 0.
 
 
 def bound_heaps(number: int, map_large: bool = False) -> None:
-    """Make threads share ``number`` heaps, with ``map_large`` except for large pieces. Call it before starting threads.
+    """Make threads share ``number`` heaps; ``map_large`` keeps large pieces out of them. Call it before threads start.
 
     The user's own settings, ``MALLOC_ARENA_MAX`` and ``MALLOC_MMAP_THRESHOLD_``, take precedence.
     """

@@ -59,6 +59,7 @@ class _Robot:
     T_map_odom: Pose | None = None  # of the newest pose; kept while there is no pose
     posed_at: float = 0.0  # local time of the newest pose
     heard_ns: int | None = None  # stamp of the last cloud or odometry
+    last_ns: int | None = None  # stamp of the last odometry
     odometry_ns: int | None = None  # newest odometry stamp since its clock started
     restarts: int = 0  # of odometry's frame, counted by the node
     clock_said: bool = False  # whether a log line says that the stamps contradict this node's clock
@@ -89,7 +90,7 @@ class _Robot:
         if frame == self.map_frame:
             return _refused(sample, f"odometry in frame {frame!r}, which is the map's: is it another localizer's pose?")
         with self.lock:
-            self.heard_ns = stamp_ns
+            self.heard_ns = self.last_ns = stamp_ns
             self.odometry_ns = max(stamp_ns, self.odometry_ns or stamp_ns)
         self.odometry_frame, self.body_frame = frame, ros2.frame_id(sample.payload, 1)
         return sample
@@ -98,7 +99,7 @@ class _Robot:
         """Forget map -> odom if the node has found that odometry's frame restarted."""
         with self.lock:
             if count > self.restarts:
-                self.T_map_odom, self.odometry_ns = None, self.heard_ns
+                self.T_map_odom, self.odometry_ns = None, self.last_ns
             self.restarts = count
 
     def clock(self, now_ns: int) -> str:
@@ -366,7 +367,7 @@ class Ros2Transport:
                 if pose.stamp_ns > robot.odometry_ns:
                     return  # from before the sender restarted
                 # forgets a stray stamp far ahead, but not odometry that came after this pose was made
-                robot.odometry_ns = max(pose.stamp_ns, robot.heard_ns or pose.stamp_ns)
+                robot.odometry_ns = max(pose.stamp_ns, robot.last_ns or pose.stamp_ns)
             robot.T_map_odom, robot.map_frame, robot.posed_at = pose.T_map_odom, pose.frame_id, time.monotonic()
         robot.outputs["pose"].publish(ros2.encode_pose(pose).payload)
 

@@ -13,7 +13,7 @@ MAX_REPLY = 64 * 1024
 """Largest reply to a query, bytes, unless the caller allows more."""
 
 Policy = Literal["newest", "all"]
-"""``newest``: a slow reader sees only the newest sample. ``all``: it sees all in order, but of too many the newest."""
+"""``newest``: a slow reader sees only the newest sample. ``all``: all, in order; if too many wait, the oldest go."""
 
 Urgency = Literal["realtime", "data", "report", "bulk"]
 """``realtime``: small and urgent (poses): express, never waits. ``data``: must arrive (odometry): waits for a

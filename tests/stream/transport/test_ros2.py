@@ -278,6 +278,9 @@ def test_a_pose_older_than_the_newest_odometry_does_not_hold_back_the_next(robot
     older = encode_pose(site.sessions["r1"].pose(), "json")
     robot.move(ns(0.05), message(0.05).T_odom_body)
     robot.until(lambda: site.sessions["r1"].inputs.odometry.newest.stamp_ns == ns(0.05))
+    received = site.counters().received
+    robot.clouds.publish(cloud_message(ns(0.02), POINTS))  # of the time before that odometry
+    robot.until(lambda: site.counters().received > received)
     site.net.publisher(KEYS.pose, "pose").put(older)
     site.node.publish_poses(time.monotonic())
     robot.until(lambda: any(stamp_of(pose) == ns(0.05) for pose in robot.poses))
