@@ -44,7 +44,7 @@ from coview_stream.clouds.atomic_file import atomic_path
 from coview_stream.errors import InputError
 
 PAGE = ROOT / "docs" / "results.md"
-UNMEASURED = ("report/relief.py", "viewers", "stream/transport/ros2_transport.py")
+UNMEASURED = ("report/relief.py", "viewers/", "stream/transport/ros2_transport.py")
 """Parts of the package that no benchmark runs: the picture of a map, views, ROS 2 in place of zenoh."""
 
 
@@ -384,7 +384,7 @@ def _made_by(name: str) -> str:
 
     def add(module: str) -> None:
         file = ROOT / f"{module.replace('.', '/')}.py"
-        if module.startswith("bench.") and file.is_file() and file not in files:
+        if module.startswith("bench.") and module != __name__ and file.is_file() and file not in files:
             files.append(file)
             for part in imported(file.read_bytes()):
                 add(part)
