@@ -17,6 +17,7 @@ from coview_stream.config.mount import Mount
 from coview_stream.errors import RunError
 from coview_stream.geometry.arrays import Floats, Ints
 from coview_stream.geometry.transforms import Pose, Poses, exp_so3, interpolate, inverse, orthonormal, pose_from, rot_z
+from coview_stream.recordings.layouts import sweeps_in
 from coview_stream.recordings.run import Run
 
 _MAX_GAP = 0.5  # seconds between two poses
@@ -26,7 +27,6 @@ _KITTI_CALIBRATION = "calib_imu_to_velo.txt"
 _KITTI_COLUMNS = 6  # latitude, longitude, height, roll, pitch, yaw; more follow
 _EARTH = 6_378_137.0  # metres; radius of the sphere in the dataset's own tools
 
-_MULRAN_SWEEPS = ("sensor_data/Ouster", "Ouster")
 _MULRAN_POSES = "global_pose.csv"
 _MULRAN_COLUMNS = 13  # stamp and the first three rows of world <- vehicle
 _MAX_SKEW = 1e-3  # of a rotation matrix in text
@@ -63,11 +63,6 @@ def open_kitti_raw(path: Path, mount: Mount | None = None) -> Run:
     return replace(run, poses=run.poses @ inverse(T_velo_imu))
 
 
-def find_sweeps(path: Path) -> Path | None:
-    """Return the folder with a MulRan run's sweeps; None if ``path`` is not such a run."""
-    return next((path / name for name in _MULRAN_SWEEPS if (path / name).is_dir()), None)
-
-
 def open_mulran(path: Path, sweeps: Path, mount: Mount | None = None) -> Run:
     """Open a MulRan run: Ouster sweeps named by their stamps, and the vehicle's poses in ``global_pose.csv``.
 
@@ -80,11 +75,8 @@ def open_mulran(path: Path, sweeps: Path, mount: Mount | None = None) -> Run:
                        if (folder / _MULRAN_POSES).is_file()), None)  # fmt: skip
     if poses_file is None:
         raise RunError(f"{path / _MULRAN_POSES}: no such file; MulRan's sweeps need it for their odometry")
-    files = sorted((file for file in sweeps.glob("*.bin") if file.stem.isdecimal()), key=lambda file: int(file.stem))
-    if not files:
-        raise RunError(f"{sweeps}: no sweeps named by their stamps (1564718964270138112.bin)")
+    files, stamps = sweeps_in(sweeps)
     pose_stamps, T = _mulran_poses(poses_file)
-    stamps = np.array([int(file.stem) for file in files], dtype=np.int64)
     return _paired(path, files, stamps, pose_stamps, T, poses_file.name, (), mount)
 
 

@@ -12,7 +12,7 @@ from coview_stream.clouds.files import CLOUD_SUFFIXES, is_cloud_name
 from coview_stream.clouds.rows import suffix_of
 from coview_stream.clouds.trajectory import columns_of, read_kitti_poses, read_times, read_tum
 from coview_stream.errors import RunError, nearest
-from coview_stream.geometry.arrays import Floats
+from coview_stream.geometry.arrays import Floats, Ints
 from coview_stream.geometry.transforms import Pose, Poses, inverse
 
 _KITTI_COLUMNS = 12
@@ -24,6 +24,7 @@ _FOLDERS = {
     "Scans": ("odom_poses.txt", "optimized_poses.txt"),  # saved by SC-LIO-SAM and SC-A-LOAM
 }
 """Folders of frames, and odometry files next to them; the first existing file counts."""
+_MULRAN_SWEEPS = ("sensor_data/Ouster", "Ouster")
 _LAYOUTS = (
     "frames/NNNNNN.pcd (ply, bin, npy, las, laz) beside odometry.tum, KITTI's velodyne/*.bin with times.txt and "
     "poses.txt, SC-LIO-SAM's Scans/*.pcd with times.txt and odom_poses.txt, MulRan's folders, a drive of KITTI's raw "
@@ -59,6 +60,8 @@ def find_layout(path: Path) -> Layout:
         if suffix_of(path) not in CLOUD_SUFFIXES:
             raise RunError(f"{path}: neither a run nor a cloud ({', '.join(sorted(CLOUD_SUFFIXES))})")
         return Layout(path, (path,))
+    if (sweeps := find_sweeps(path)) is not None:
+        return Layout(path, sweeps_in(sweeps)[0])
     for folder, names in _FOLDERS.items():
         if (path / folder).is_dir():
             frames = _frames(path / folder)
@@ -71,7 +74,7 @@ def find_layout(path: Path) -> Layout:
             "/cloud_registered_body and /Odometry in a bag, and give that"
         )
     for within in sorted(path.iterdir()):
-        if any((within / folder).is_dir() for folder in _FOLDERS):
+        if _has_frames(within):
             raise RunError(f"{path}: is no run; did you mean {within}?")
     if any(is_cloud_name(file) for file in path.iterdir()):
         raise RunError(f"{path}: clouds lie in the directory itself; a run has {_LAYOUTS}")
@@ -80,16 +83,34 @@ def find_layout(path: Path) -> Layout:
     raise RunError(f"{path}: no frames/ directory; a run has {_LAYOUTS}")
 
 
+def find_sweeps(path: Path) -> Path | None:
+    """Return the folder with a MulRan run's sweeps; None if ``path`` is not such a run."""
+    return next((path / name for name in _MULRAN_SWEEPS if (path / name).is_dir()), None)
+
+
+def sweeps_in(folder: Path) -> tuple[tuple[Path, ...], Ints]:
+    """Return the sweeps of a MulRan run and their stamps (N,) nanoseconds, in order; RunError for none."""
+    files = {int(file.stem): file for file in folder.glob("*.bin") if file.stem.isdecimal()}
+    if not files:
+        raise RunError(f"{folder}: no sweeps named by their stamps (1564718964270138112.bin)")
+    stamps = sorted(files)
+    return tuple(files[stamp] for stamp in stamps), np.array(stamps, dtype=np.int64)
+
+
 def is_run(path: Path) -> bool:
-    """Return whether a path is a recording, or a directory with a run's frames (but not MulRan's)."""
-    return find_bag(path) is not None or any((path / folder).is_dir() for folder in _FOLDERS)
+    """Return whether a path is a recording, or a directory with a run's frames."""
+    return find_bag(path) is not None or _has_frames(path)
+
+
+def _has_frames(path: Path) -> bool:
+    return find_sweeps(path) is not None or any((path / folder).is_dir() for folder in _FOLDERS)
 
 
 def find_bag(path: Path) -> Path | None:
     """Find the recording at ``path``, file or rosbag2 directory, else None. RunError: several, no metadata.yaml."""
     if not path.is_dir():
         return path if path.suffix in _BAGS and path.is_file() else None
-    if (path / "frames").is_dir() or (path / "velodyne").is_dir():
+    if _has_frames(path):
         return None
     if (path / "metadata.yaml").is_file():
         return path
@@ -139,6 +160,8 @@ def read_stamps(layout: Layout) -> Floats | None:
         stamps = read_times(file)
     elif layout.odometry is not None and columns_of(layout.odometry) != _KITTI_COLUMNS:
         file, stamps = layout.odometry, read_tum(layout.odometry)[0]
+    elif (sweeps := find_sweeps(layout.path)) is not None:
+        stamps = sweeps_in(sweeps)[1].astype(np.float64) * 1e-9
     if file is not None and stamps is not None:
         _check_count(file, len(stamps), "stamps", layout)
     return stamps

@@ -33,11 +33,11 @@ def open_lidar_run(
 ) -> Run:
     """Open a run like :func:`~coview_stream.recordings.open_run.open_run`, with odometry computed from its clouds.
 
-    Frames in files count as deskewed; their stamps come from ``times.txt`` or ``odometry.tum``, else they are 0.1 s
-    apart. Frames that odometry cannot place are left out and counted in the notes.
+    Frames in files count as deskewed; their stamps come from ``times.txt``, ``odometry.tum`` or MulRan's names, else
+    they are 0.1 s apart. Frames that odometry cannot place are left out and counted in the notes.
 
     Raises:
-        RunError: no frames, a MulRan folder, or odometry could place none. DependencyError: kiss-icp is missing.
+        RunError: no frames, or odometry could place none. DependencyError: kiss-icp is missing.
     """
     if odometry_topic is not None:
         raise RunError(f"{path}: --odometry kiss-icp and --odometry-topic {odometry_topic}; give one of them")
@@ -115,11 +115,11 @@ def _place_all(
 def open_bare_run(path: Path, cloud_topic: str | None = None, mount: Mount | None = None) -> Run:
     """Open a run like :func:`~coview_stream.recordings.open_run.open_run`, but with the identity for every pose.
 
-    Stamps of frames in files come from ``times.txt`` or ``odometry.tum``, else they are 0.1 s apart. Clouds of
-    recordings are not deskewed.
+    Stamps of frames in files come from ``times.txt``, ``odometry.tum`` or MulRan's names, else they are 0.1 s apart.
+    Clouds of recordings are not deskewed.
 
     Raises:
-        RunError: no frames, a MulRan folder, or stamps that do not match.
+        RunError: no frames, or stamps that do not match.
     """
     if (bag := find_bag(path)) is not None:
         return open_bag(bag, None, cloud_topic, None, lambda clouds: Track(clouds.stamps, clouds.poses), mount)

@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING
 
 from coview_stream.config.mount import Mount
 from coview_stream.errors import RunError
-from coview_stream.recordings.datasets import find_sweeps, is_kitti_raw, open_kitti_raw, open_mulran
-from coview_stream.recordings.layouts import find_bag, find_layout, read_odometry
+from coview_stream.recordings.datasets import is_kitti_raw, open_kitti_raw, open_mulran
+from coview_stream.recordings.layouts import find_bag, find_layout, find_sweeps, read_odometry
 from coview_stream.recordings.run import Run, single_frame_run
 
 if TYPE_CHECKING:

@@ -2,10 +2,15 @@
 
 import numpy as np
 import pytest
+from fake_lidar_odometry import Truth
 
 from coview_stream.clouds.files import write_cloud
+from coview_stream.config.odometry import LidarOdometryConfig
 from coview_stream.errors import RunError
 from coview_stream.geometry.transforms import pose_from, rot_z
+from coview_stream.odometry.lidar_odometry import LidarOdometry
+from coview_stream.recordings.layouts import find_bag, is_run
+from coview_stream.recordings.lidar_runs import open_bare_run
 from coview_stream.recordings.open_run import open_run
 
 POINTS = np.random.default_rng(1).uniform(-20, 20, (3000, 3)).astype(np.float32)
@@ -64,6 +69,21 @@ def test_incomplete_folder_of_mulran_names_what_is_missing(mulran):
     file.unlink()
     with pytest.raises(RunError, match=r"global_pose\.csv: no such file"):
         open_run(mulran)
+
+
+def test_folder_of_mulran_needs_no_poses_if_odometry_is_made_of_the_clouds(mulran):
+    (mulran / "global_pose.csv").unlink()
+    assert is_run(mulran)
+    lidar = LidarOdometry(LidarOdometryConfig(gravity="level"), registration=Truth(POSES))
+    for run in (open_run(mulran, "kiss-icp", lidar=lidar), open_bare_run(mulran)):
+        np.testing.assert_allclose(run.stamps, 1_561_000_444.44 + 0.1 * np.arange(5), atol=1e-6)
+
+
+@pytest.mark.parametrize("folder", ["frames", "velodyne", "velodyne_points/data", "Scans", "sensor_data/Ouster"])
+def test_recording_beside_the_frames_of_a_run_is_not_the_run(tmp_path, folder):
+    (tmp_path / folder).mkdir(parents=True)
+    (tmp_path / "recorded.bag").touch()
+    assert find_bag(tmp_path) is None
 
 
 @pytest.fixture
