@@ -11,7 +11,7 @@ from coview_stream.basemap.file_format import Arrays
 from coview_stream.basemap.ground import ground_filter
 from coview_stream.basemap.map_arrays import MemoryArrays, MemoryTile, map_arrays
 from coview_stream.basemap.sources import Source, short_names, warn_of_other_systems
-from coview_stream.basemap.stations import below_another, describe_storeys, find_stations
+from coview_stream.basemap.stations import describe_storeys, find_stations
 from coview_stream.basemap.tiles import scaled_normals, sort_by_tile
 from coview_stream.clouds.cloud import merge
 from coview_stream.clouds.cloud_head import check_together, extent_in_words, head_of
@@ -119,7 +119,6 @@ def _build(sources: list[Source], config: MapConfig, stage: Callable[[str], Prog
         "sources": {name: source.sha256() for name, source in zip(short_names(paths), sources, strict=True)},
         "source_points": source_points,
         "ground_filter": ground_filter(points),  # depends on the platform
-        "stations_below_another": int(below_another(stations, config.block).sum()),
         "learned": learned[1],
     }
     return arrays, parameters

@@ -32,7 +32,7 @@ from coview_stream.geometry.arrays import Floats, Ints
 JOINED_SUFFIX = ".joined"
 
 _NAMES_FORMAT = "coview-joined"
-_VERSION = 2  # in the file's name; counts changes of the arrays that are built from the same maps
+_VERSION = 3  # in the file's name; counts changes of the files that are made of the same maps
 
 _MIN_GAP = 300.0  # metres: a lidar's range, and a margin beyond the map's edge
 _SHARED = ("block", "voxel", "tile", "descriptor")
@@ -140,7 +140,8 @@ def join_maps(maps: Mapping[str, BaseMap]) -> BaseMap:
     channels = config.descriptor.channels
     described = {name: np.concatenate([base_map.descriptors(name) for base_map in several]) for name in channels}
     arrays |= StationIndex.of(described).arrays()
-    parameters: dict[str, Any] = dict(first.parameters) | {
+    parameters: dict[str, Any] = {
+        "config": first.parameters["config"],
         "crs": None,
         "parts": MapParts(parts).to_json(),
         "sources": {f"{name}/{source}": sha for name, m in maps.items() for source, sha in m.sources.items()},

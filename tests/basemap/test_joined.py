@@ -84,6 +84,12 @@ def test_joined_map_is_a_map(both, world_map, upper, tmp_path):
     assert list(view.parts) == list(parts)
 
 
+def test_facts_of_one_map_are_not_the_joined_maps(world_map, upper):
+    made = {"site": "0" * 64, "made_tiles": [], "ground_filter": "cloth"}
+    joined = join_maps({"a": BaseMap(world_map.arrays, world_map.parameters | made), "b": upper})
+    assert joined.parameters.keys() == {"config", "crs", "parts", "sources", "source_points", "learned"}
+
+
 def test_maps_that_do_not_go_together_are_named(world_map):
     finer = BaseMap(
         world_map.arrays, world_map.parameters | {"config": world_map.parameters["config"] | {"voxel": 0.5}}
