@@ -14,7 +14,7 @@ import numpy.typing as npt
 
 from coview_stream.clouds.atomic_file import atomic_file
 from coview_stream.clouds.reference_system import GeoReference
-from coview_stream.errors import ConfigError, InputError
+from coview_stream.errors import ConfigError, InputError, counted
 from coview_stream.geometry.arrays import Floats
 from coview_stream.geometry.transforms import Poses, pose_to_tum
 
@@ -147,6 +147,11 @@ def trajectory_of(
 def _geodetic(trajectory: Trajectory) -> Floats:
     if trajectory.geodetic is None:
         raise InputError("the map states no reference system: no latitude and longitude; build it with --crs EPSG:N")
+    if lost := int((~np.isfinite(trajectory.geodetic).all(axis=1)).sum()):
+        raise InputError(
+            f"{trajectory.name}: {lost} of {counted(len(trajectory.poses), 'pose')} lie nowhere on Earth in the map's "
+            "reference system: export csv or kitti, or build the map with the right --crs EPSG:N"
+        )
     return trajectory.geodetic
 
 

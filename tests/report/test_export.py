@@ -54,6 +54,14 @@ def test_gpx(located):
     assert points[1].findtext("g:time", namespaces=space) == "2023-11-14T22:13:21.500Z"
 
 
+@pytest.mark.parametrize("name", ["geojson", "gpx"])
+def test_poses_nowhere_on_earth_are_refused(name):
+    far = [POSES[0], POSES[1] + pose_from(np.zeros((3, 3)), [1e9, 0.0, 0.0]), POSES[2]]
+    lost = trajectory_of("run", STAMPS, far, GeoReference("EPSG:25832"))
+    with pytest.raises(InputError, match=r"run: 1 of 3 poses lie nowhere on Earth.*export csv.*--crs"):
+        FORMATS[name][1](lost)
+
+
 def test_stamps_that_are_no_times_of_day_are_none():
     found = trajectory_of("run", [0.1, 0.2, 0.3], POSES, GeoReference("EPSG:25832"))
     assert "<time>" not in FORMATS["gpx"][1](found)
