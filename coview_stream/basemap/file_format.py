@@ -349,6 +349,9 @@ def check_arrays(arrays: Mapping[str, npt.NDArray[Any]], config: MapConfig, poin
             length = dimension if isinstance(dimension, int) else known.setdefault(dimension, actual)
             if actual != length:
                 raise _refused(name, f"has the shape {array.shape}, with {actual} where {length} were expected")
+    for name in ("stations", "points"):
+        if not len(arrays[name]):
+            raise _refused(name, "are none")
     if not np.isfinite(arrays["origin"]).all():
         raise _refused("origin", "is not finite")
     size = config.block * np.array(arrays["surveyed"].shape[::-1], dtype=np.float64)

@@ -127,6 +127,12 @@ def test_many_stations_above_one_another_are_refused(undescribed, load):
         _ = load(undescribed).station_grid
 
 
+@pytest.mark.parametrize("name", ["stations", "points"])
+def test_map_without_stations_or_points_is_refused(undescribed, load, name):
+    with pytest.raises(MapError, match=f"the map's {name} are none; copy or build it again"):
+        load(undescribed | {each: undescribed[each][:0] for each in {name, name.replace("points", "normals")}})
+
+
 @pytest.mark.parametrize(
     "parameters",
     [
