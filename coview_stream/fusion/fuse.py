@@ -12,10 +12,10 @@ import numpy.typing as npt
 import coview_kernels as kernels
 from coview_stream.basemap.basemap import BaseMap
 from coview_stream.config.checks import check_types, require
-from coview_stream.errors import CloudError, ConfigError
+from coview_stream.errors import CloudError, ConfigError, InputError
 from coview_stream.fusion.localized_run import LocalizedRun
 from coview_stream.fusion.sightings import REACH, Counts, Sightings, VoxelTable, distances, looks_at, within
-from coview_stream.geometry.arrays import Bools, Floats, Floats32, Ints
+from coview_stream.geometry.arrays import Bools, Floats, Floats32, Ints, Reals
 from coview_stream.geometry.rasters import max_filter
 from coview_stream.geometry.transforms import Points
 
@@ -36,7 +36,7 @@ def records(points: Floats, source: npt.ArrayLike, change: npt.ArrayLike, stamp:
 
 _CELL = 0.5  # metres, of the raster of greatest heights
 _AROUND = 5  # cells: eaves and crowns hide objects within a metre
-_MAX_CELLS = 400_000_000  # 100 km2, 1.6 GB
+_MAX_AREA = 1e8  # square metres; a raster of 1.6 GB
 
 
 def top_around(base_map: BaseMap, points: Points) -> Floats32:
@@ -45,16 +45,22 @@ def top_around(base_map: BaseMap, points: Points) -> Floats32:
     A survey from above would show a higher object; it may miss a lower one, which is a facade or hidden below a roof
     or a crown.
     """
-    low = np.floor(points[:, :2].min(axis=0).astype(np.float64) - 2.0)
-    shape = np.ceil((points[:, :2].max(axis=0).astype(np.float64) + 2.0 - low) / _CELL).astype(int) + 1
-    if int(shape[0]) * int(shape[1]) > _MAX_CELLS:
-        raise ValueError(f"an area of {shape[0] * _CELL:.0f} x {shape[1] * _CELL:.0f} m")
-    top = np.full(tuple(shape), -np.inf, dtype=np.float32)
+    low, size = _around(points)
+    top = np.full(tuple(np.ceil(size / _CELL).astype(int) + 1), -np.inf, dtype=np.float32)
     for begin in range(0, len(base_map.points), _CHUNK):
         part = np.asarray(base_map.points[begin : begin + _CHUNK])
         inside, cells = _within_raster(np.floor((part[:, :2] - low) / _CELL), top)
         np.maximum.at(top, cells, part[inside, 2])
     return np.asarray(max_filter(top, _AROUND)[_within_raster(np.floor((points[:, :2] - low) / _CELL), top)[1]])
+
+
+def _around(points: Reals) -> tuple[Floats, Floats]:
+    """Return lower corner and size (2,), metres, of a rectangle around points (N, 2 or 3); InputError: over 100 km2."""
+    low = np.floor(points[:, :2].min(axis=0).astype(np.float64) - 2.0)
+    size = points[:, :2].max(axis=0).astype(np.float64) + 2.0 - low
+    if size.prod() > _MAX_AREA:
+        raise InputError(f"the runs cover {size[0]:.0f} x {size[1]:.0f} m, 100 km2 at most: fuse them one by one")
+    return low, size
 
 
 def _within_raster(cells: Floats, raster: npt.NDArray[Any]) -> tuple[Ints, tuple[Ints, ...]]:
@@ -150,10 +156,12 @@ def fuse(
     not all points.
 
     Raises:
-        InputError: a frame lies too far from the map.
-        CloudError: no point of the runs is in range. ValueError: their bounding rectangle is larger than 100 km2.
+        InputError: a frame lies too far from the map, or the runs' bounding rectangle is larger than 100 km2.
+        CloudError: no point of the runs is in range.
     """
     config = config or FuseConfig(voxel=base_map.config.voxel)
+    if runs:
+        _around(np.concatenate([run.poses[:, :3, 3] for run in runs]))  # before anything slow
     table, taken = _surfaces(runs, config, progress)
     if not len(table):
         raise CloudError(f"no run has a point from {config.range_min:g} to {config.range_max:g} m from its lidar")

@@ -6,6 +6,7 @@ import small_world
 from localized_drives import localized
 from small_world import Box
 
+from coview_stream.errors import InputError
 from coview_stream.fusion.fuse import GONE, NEW, FuseConfig, fuse
 from coview_stream.geometry.transforms import transform
 
@@ -72,6 +73,15 @@ def test_who_walked_by_is_left_out(world_map, scene, tmp_path):
     assert kept > 10
     assert near(fused) < 0.35 * kept
     assert fused.moving > 5
+
+
+def test_runs_over_more_than_100_km2_are_refused_before_frames_are_read(world_map, world_drive, tmp_path):
+    off = np.zeros((len(world_drive.clouds), 3))
+    off[-1, :2] = 15_000.0, 12_000.0
+    read = []
+    with pytest.raises(InputError, match=r"15\d\d\d x 12\d\d\d m, 100 km2 at most"):
+        fuse(world_map, [localized(world_map, tmp_path, world_drive, off)], progress=lambda *at: read.append(at))
+    assert not read
 
 
 def test_two_runs_have_their_numbers(world_map, world_drive, slow_drive, tmp_path):
