@@ -172,9 +172,7 @@ def run(args: argparse.Namespace) -> int:
         options = serve_options(args, tables)
         hangups: list[int] = []
         with contextlib.ExitStack() as views:
-            sinks = open_sinks(args)
-            for sink in sinks:  # a feed that was never opened does not close them
-                views.callback(sink.close)
+            sinks = open_sinks(args, views)
             with stop_on_signals(lambda: hangups.append(1)) as stop:
                 ended = _serve(options, stop, children, hangups, sinks)
         if not ended:  # a regular exit would wait for the thread that hangs in the network
@@ -352,7 +350,7 @@ def _serve(
     def work() -> None:
         try:
             opened.append(node := open_node(options, lambda: stop.requested, children, notifier))
-            feeds.append(feed_of_node(node, options.keys, options.node.mount, sinks))
+            feeds.append(feed_of_node(node, options, sinks))
         except CancelledError:
             pass
         except BaseException as error:
@@ -372,6 +370,8 @@ def _serve(
             break
     notifier.stopping()
     if failed and not stop.requested:
+        for node in opened:  # its views failed
+            node.close(_MAX_SHUTDOWN)
         raise failed[0]
     end = stop.now() + _MAX_SHUTDOWN
     for feed in filter(None, feeds):

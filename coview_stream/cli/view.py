@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 import sys
 from collections.abc import Sequence
+from contextlib import ExitStack
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -13,9 +14,8 @@ from coview_stream.errors import ConfigError
 
 if TYPE_CHECKING:
     from coview_stream.basemap.summary import MapView
-    from coview_stream.config.mount import Mount
     from coview_stream.stream.node.node import Node
-    from coview_stream.stream.transport.keys import RobotKeys
+    from coview_stream.stream.node.serve import ServeOptions
     from coview_stream.stream.transport.transport import Transport
     from coview_stream.viewers.scene import Sink
     from coview_stream.viewers.session_feed import SessionFeed, Topic
@@ -46,8 +46,8 @@ def add_view(parser: argparse._ActionsContainer) -> None:
     parser.add_argument("--rerun", action="store_true", help="show map and robots in rerun (extra viz)")
 
 
-def open_sinks(args: argparse.Namespace) -> list[Sink]:
-    """Open the requested sinks, and print their addresses."""
+def open_sinks(args: argparse.Namespace, closing: ExitStack) -> list[Sink]:
+    """Open the requested sinks, and print their addresses; ``closing`` closes them, also if no feed ever does."""
     sinks: list[Sink] = []
     mcap, rrd = ([path for path in args.record if path.suffix == suffix] for suffix in (".mcap", ".rrd"))
     for path in args.record:
@@ -56,11 +56,14 @@ def open_sinks(args: argparse.Namespace) -> list[Sink]:
     if args.rerun or rrd:
         from coview_stream.viewers.rerun_sink import RerunSink
 
-        sinks += [RerunSink(path) for path in [*([None] if args.rerun else []), *rrd]]
+        for path in [*([None] if args.rerun else []), *rrd]:
+            sinks.append(rerun := RerunSink(path))
+            closing.callback(rerun.close)
     if args.foxglove is not None or mcap:
         from coview_stream.viewers.foxglove_sink import FoxgloveSink
 
-        foxglove = FoxgloveSink()
+        sinks.append(foxglove := FoxgloveSink())
+        closing.callback(foxglove.close)
         for path in mcap:
             foxglove.record(path)
         if args.foxglove is not None:
@@ -68,11 +71,11 @@ def open_sinks(args: argparse.Namespace) -> list[Sink]:
             host = host.strip("[]") or "127.0.0.1"
             port = foxglove.serve(host, int(port))
             print(f"Foxglove at ws://{host}:{port}", file=sys.stderr, flush=True)
-        sinks.append(foxglove)
     if args.web is not None:
         from coview_stream.viewers.web_page import WebPage
 
         page = WebPage(args.web)
+        closing.callback(page.close)
         print(f"page at {page.url}", file=sys.stderr, flush=True)
         sinks.append(page.sink)
     return sinks
@@ -90,14 +93,15 @@ def feed_of_watch(
     return _running(SessionFeed(transport, topics, view, source, clouds=not args.no_clouds), sinks)
 
 
-def feed_of_node(node: Node, keys: Sequence[RobotKeys], mount: Mount, sinks: Sequence[Sink]) -> SessionFeed | None:
+def feed_of_node(node: Node, options: ServeOptions, sinks: Sequence[Sink]) -> SessionFeed | None:
     """Return a running feed of a node in this process, on the node's own session; None without sinks."""
     if not sinks:
         return None
     from coview_stream.viewers.session_feed import SessionFeed, read_from_files, topics_of_robots
 
     source = read_from_files(node.map_files, lambda: node.map_sha256)
-    feed = SessionFeed(node.transport, topics_of_robots(keys), None, source, mount=mount, policy="newest")
+    topics = topics_of_robots(options.keys, options.codecs.cloud)
+    feed = SessionFeed(node.transport, topics, None, source, mount=options.node.mount, policy="newest")
     return _running(feed, sinks)
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import contextlib
 import functools
 import json
 import shutil
@@ -59,18 +60,17 @@ def run(args: argparse.Namespace) -> int:
     topics = _topics(args)
     view = None
     if args.map is not None:
-        view = MapView.of(BaseMap.load(local_map(args.map, base=args.base).path, check=False))
-    sinks, feed = open_sinks(args), None
-    transport = open_client(args.connect, args.listen, args.zenoh_config)
-    try:
-        with stop_on_signals() as stop:
-            feed = feed_of_watch(args, transport, sinks, view, topics)
-            watch = _Watch(args, FleetTable(), [t for t in topics if t.kind in ("pose", "status")], transport)
-            watch.run(stop, None if args.seconds is None else time.monotonic() + args.seconds)
-    finally:
-        if feed is not None:
-            feed.close()
-        transport.close()
+        shown = local_map(args.map, base=args.base, connect=args.connect, config=args.zenoh_config)
+        view = MapView.of(BaseMap.load(shown.path, check=False))
+    with contextlib.ExitStack() as closing:
+        sinks = open_sinks(args, closing)
+        transport = open_client(args.connect, args.listen, args.zenoh_config)
+        closing.callback(transport.close)
+        stop = closing.enter_context(stop_on_signals())
+        if (feed := feed_of_watch(args, transport, sinks, view, topics)) is not None:
+            closing.callback(feed.close)
+        watch = _Watch(args, FleetTable(), [t for t in topics if t.kind in ("pose", "status")], transport)
+        watch.run(stop, None if args.seconds is None else time.monotonic() + args.seconds)
     return 0
 
 

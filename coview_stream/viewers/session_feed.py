@@ -64,17 +64,20 @@ class Topic(NamedTuple):
     hint: str | None = None
     """Codec of messages without Encoding."""
     depth: int = 0
+    codec: str | None = None
+    """Codec of all messages, whatever their Encoding says."""
 
     def robot_of(self, sample: Sample) -> str:
         """Return the robot that a sample belongs to."""
         return self.robot or sample.key.split("/")[self.depth]
 
 
-def topics_of_robots(keys: Sequence[RobotKeys]) -> list[Topic]:
-    """Return the topics of named robots, for any preset."""
+def topics_of_robots(keys: Sequence[RobotKeys], cloud_codec: str | None = None) -> list[Topic]:
+    """Return the topics of named robots, for any preset; ``cloud_codec`` as in ``serve --cloud-encoding``."""
     topics = []
     for k in keys:
-        topics += [Topic(k.pose, "pose", k.robot, k.hint), Topic(k.cloud, "cloud", k.robot, k.hint)]
+        topics += [Topic(k.pose, "pose", k.robot, k.hint)]
+        topics += [Topic(k.cloud, "cloud", k.robot, k.hint, codec=cloud_codec)]
         topics += [Topic(k.status, "status", k.robot), Topic(k.hypotheses, "hypotheses", k.robot)]
     return topics
 
@@ -274,7 +277,7 @@ class SessionFeed:
                 continue
             self._next_scan[robot] = now + _SCAN_PERIOD
             try:
-                message = decode_cloud(sample, hint=topic.hint).limited(2 * _SCAN_POINTS)
+                message = decode_cloud(sample, topic.codec, topic.hint).limited(2 * _SCAN_POINTS)
             except MessageError as error:
                 self._errors.report(sample.key, error)
                 continue

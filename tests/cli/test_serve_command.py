@@ -1,5 +1,6 @@
 """``coview-stream serve`` ends on a signal, even while it waits, and refuses robots that it could not tell apart."""
 
+import contextlib
 import logging
 import signal
 import socket
@@ -78,11 +79,15 @@ def test_cancelled_opening_stops_engines(world_file):
     until(lambda: not [t for t in threading.enumerate() if t.name.startswith(ours)])
 
 
-def test_node_that_does_not_close_is_abandoned(monkeypatch):
-    stuck = SimpleNamespace(close=lambda patience: False)
-    monkeypatch.setattr(serve, "open_node", lambda *_: stuck)
-    stop = SimpleNamespace(requested=True, wait=lambda seconds: True, now=lambda: 0.0)
-    assert command._serve(None, stop) is False
+@pytest.mark.parametrize("told", [True, False])
+def test_node_that_does_not_close_is_abandoned_also_where_its_views_fail(monkeypatch, told):
+    asked = []
+    monkeypatch.setattr(serve, "open_node", lambda *_: SimpleNamespace(close=asked.append))
+    stop = SimpleNamespace(requested=told, wait=lambda seconds: told, now=lambda: 0.0)
+    views = [object()]  # fail, as the node has no files of maps
+    with contextlib.nullcontext() if told else pytest.raises(AttributeError, match="map_files"):
+        assert command._serve(None, stop, sinks=views) is False
+    assert len(asked) == 1
 
 
 @pytest.mark.parametrize(

@@ -183,6 +183,18 @@ def test_missing_viewer_library_is_named(monkeypatch, capsys):
     assert "--rerun: rerun is not installed; " in capsys.readouterr().err
 
 
+@pytest.mark.usefixtures("cache")
+def test_map_is_asked_for_where_the_network_options_say(refused):
+    endpoint = free_endpoint()
+    assert f"zenoh://yard ({endpoint})" in refused("watch", "--connect", endpoint, "--map", "zenoh://yard")
+
+
+@pytest.mark.parametrize("failing", ["--web=192.0.2.1:1", "--connect=nonsense"])
+def test_views_are_closed_where_what_follows_them_fails(tmp_path, refused, failing):
+    refused("watch", "--record", tmp_path / "a.mcap", failing)
+    assert not list(tmp_path.iterdir())  # a recording of nothing is removed once it is closed
+
+
 @pytest.mark.parametrize(
     ("options", "text"),
     [

@@ -2,7 +2,10 @@
 
 import json
 import threading
+from contextlib import closing
 from dataclasses import replace
+from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -10,12 +13,14 @@ from fake_robot import KEYS, SHA, cloud, ns
 from sockets import until
 
 from coview_stream.basemap.summary import MapView
+from coview_stream.cli.view import feed_of_node
 from coview_stream.config.mount import Mount
 from coview_stream.errors import ConfigError, TransportError
 from coview_stream.geometry.transforms import pose_from, rot_z
 from coview_stream.messages import encode_pose
 from coview_stream.messages.json_messages import encode_hypotheses
 from coview_stream.messages.types import HypothesesMessage, PoseMessage, Sample
+from coview_stream.stream.node.serve import CodecOptions, ServeOptions
 from coview_stream.stream.transport.keys import robot_keys
 from coview_stream.stream.transport.memory_transport import MemoryTransport
 from coview_stream.viewers.scene import PoseTrack, Sink
@@ -135,6 +140,14 @@ def test_robots_of_a_base_are_told_by_their_keys(net, kept):
 def test_a_base_that_is_none_is_refused():
     with pytest.raises(ConfigError, match="--base"):
         topics_of_base("a//b")
+
+
+def test_clouds_without_an_encoding_are_read_by_the_nodes_codec(net, kept):
+    node = SimpleNamespace(transport=net, map_files={}, map_sha256=SHA)
+    options = ServeOptions(Path("site.coview"), [KEYS], codecs=CodecOptions(cloud="xyz"))
+    with closing(feed_of_node(node, options, [kept])):
+        net.publish(replace(cloud(0.0), encoding=""))
+        kept.wait("scan")
 
 
 def test_a_scan_comes_with_the_pose_of_its_time_and_mounted(net, kept):
