@@ -193,9 +193,8 @@ class ReplayReport:
         ]
         late = sum(ms > 1e3 * _LATE for ms in self.late_ms)
         if late:
-            lines.append(
-                f"more than {1e3 * _LATE:.0f} ms late: {counted(late, 'frame')}; is the machine busy, or the disk slow?"
-            )
+            said = f"more than {1e3 * _LATE:.0f} ms late: {counted(late, 'sample')}"
+            lines.append(f"{said}; is the machine busy, or the disk slow?")
         if self.damaged:
             lines.append(f"{self.damaged} damaged frames left out, the first: {self.first_error}")
         if not self.heard:

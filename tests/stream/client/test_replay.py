@@ -138,7 +138,7 @@ def test_slow_send_does_not_delay_later_deadlines(run):
     assert times == pytest.approx([0.0, 0.17, 0.2, 0.35])
     assert list(report.late_ms) == pytest.approx([0, 70, 0, 0], abs=1e-6)
     assert report.put_ms[0] == pytest.approx(170)
-    assert "more than 20 ms late: 1 frame;" in report.text()
+    assert "more than 20 ms late: 1 sample;" in report.text()
 
 
 def test_damaged_frames_are_skipped_and_counted(run_folder, tmp_path):
