@@ -34,7 +34,7 @@ def deskew(
 
     Args:
         points: (N, 3) float32, each in the body frame at its own time, metres.
-        times: (N,) seconds after ``stamp_ns`` (negative before); NaN is 0, and outside the segment its nearer end.
+        times: (N,) seconds after ``stamp_ns`` (negative before), 0 if not finite; beyond the segment its end counts.
         segment: odometry that covers the sweep; with fewer than two samples nothing moves.
         stamp_ns: the frame's stamp.
         T_odom_body: (4, 4) odometry at that stamp.
@@ -43,7 +43,7 @@ def deskew(
     if len(segment.stamps) < 2 or not len(points):
         return points
     at = (segment.stamps - stamp_ns) * 1e-9
-    clipped = np.clip(np.nan_to_num(times, nan=0.0), at[0], at[-1])
+    clipped = np.clip(np.where(np.isfinite(times), times, 0.0), at[0], at[-1])
     low, high = float(clipped.min()), float(clipped.max())
     if max(-low, high) < _INSTANT:
         return points

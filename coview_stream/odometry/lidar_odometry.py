@@ -135,7 +135,7 @@ class LidarOdometry:
         Args:
             points: (N, 3) body frame (x forward, z up), metres; rows with NaN are dropped.
             point_times: (N,) seconds of the points after ``stamp`` (negative before); None for a deskewed frame. Equal
-                times deskew nothing; a point whose time is NaN stays.
+                times deskew nothing; a point whose time is not finite stays.
             stamp: seconds, later than the stamp of the previous frame.
 
         Returns:

@@ -69,15 +69,14 @@ def test_times_beyond_odometry_use_its_nearest_pose():
     np.testing.assert_allclose(moved, expected, atol=0.5 * 0.3 * SPEED / 63 + 1e-3)
 
 
-def test_nan_time_means_the_stamp_and_nan_point_affects_no_other():
-    points = np.tile(np.array([[5.0, 1.0, 0.5]], np.float32), (4, 1))
-    points[3] = np.nan
+def test_time_that_is_not_finite_means_the_stamp_and_nan_point_affects_no_other():
+    points = np.tile(np.array([[5.0, 1.0, 0.5]], np.float32), (6, 1))
+    points[5] = np.nan
     points.setflags(write=False)
-    moved = deskew(
-        points, np.array([-0.1, np.nan, 0.1, 0.05]), segment(straight, [-0.1, 0.0, 0.1]), ns(0.0), straight(0.0)
-    )
-    np.testing.assert_allclose(moved[:3, 0], [4.2, 5.0, 5.8], atol=0.02)
-    assert np.isnan(moved[3]).all()
+    times = np.array([-0.1, np.nan, np.inf, -np.inf, 0.1, 0.05])
+    moved = deskew(points, times, segment(straight, [-0.1, 0.0, 0.1]), ns(0.0), straight(0.0))
+    np.testing.assert_allclose(moved[:5, 0], [4.2, 5.0, 5.0, 5.0, 5.8], atol=0.02)
+    assert np.isnan(moved[5]).all()
     assert (points[:3] == (5.0, 1.0, 0.5)).all()
 
 
