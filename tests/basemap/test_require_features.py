@@ -14,7 +14,7 @@ from coview_stream.descriptors import network
 from coview_stream.descriptors.feature_map import weights_sha256
 from coview_stream.descriptors.network import CARD, VIEW_NAMES, Network, file_sha256
 from coview_stream.doctor.map_checks import map_findings, node_memory
-from coview_stream.errors import ConfigError, CoViewError, InputError, TransportError
+from coview_stream.errors import ConfigError, CoViewError, CoViewWarning, InputError, TransportError
 from coview_stream.localization.localizer import Localizer
 from coview_stream.localization.search.recognizers import SearchIndex
 from coview_stream.stream.node import serve
@@ -82,7 +82,7 @@ def judged(base_map, text):
     assert text in str(caught.value)
     with pytest.raises(type(caught.value)):
         Localizer(base_map, LocalizerConfig(reloc="learned"))
-    with pytest.warns(UserWarning, match="going without") as warned:
+    with pytest.warns(CoViewWarning, match="going without") as warned:
         known = SearchIndex.of(base_map, LocalizerConfig())
     assert len(warned) == 1
     assert known.learned is None

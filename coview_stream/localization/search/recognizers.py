@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-import warnings
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Protocol
 
 from coview_stream.basemap.basemap import BaseMap
 from coview_stream.config import Channel, LocalizerConfig
 from coview_stream.descriptors.coview import Descriptor, describe, on_ground
+from coview_stream.errors import warn
 from coview_stream.geometry.arrays import Floats
 from coview_stream.geometry.transforms import Pose
 from coview_stream.localization.search.consensus import Hypothesis
@@ -53,8 +53,7 @@ class SearchIndex:
         """
         retrieval = None if config.reloc == "learned" else Retrieval(base_map)
         missing = base_map.require_features(config.reloc, load)
-        if missing is not None:
-            warnings.warn(missing, stacklevel=2)
+        warn(missing)
         if missing is not None or config.reloc == "coview" or base_map.learned is None:
             return cls(retrieval, None)
         from coview_stream.localization.search.learned.matcher import FeatureMatcher
