@@ -84,7 +84,7 @@ def searched(site: Path, run_folder: Path, drives: int) -> dict[str, Any]:
             result = search.update(request)
             if number:  # caches fill during the first drive
                 times.append(1e3 * (time.perf_counter() - begin))
-                rivals.append(len(result.rivals))
+                rivals.append(result.rivals)
     return {"stations": len(base_map), "ms": times, "rivals": rivals, "megabytes": peak_megabytes()}
 
 

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import hashlib
 from collections.abc import Callable
-from dataclasses import dataclass
 from functools import cached_property, lru_cache
 from typing import Any
 
@@ -26,7 +25,7 @@ from coview_stream.descriptors.network import (
     weights_id,
 )
 from coview_stream.errors import InputError, MapError
-from coview_stream.geometry.arrays import Bools, Floats, Floats32, Int8s, Ints, Reals
+from coview_stream.geometry.arrays import Bools, Floats, Floats32, Int8s, Ints
 from coview_stream.geometry.transforms import Points
 
 TILE = 32
@@ -38,21 +37,12 @@ _MIN_SIGMA, _MAX_SIGMA = 0.02, 50.0  # range of the stored sigmas
 _STEPS = 255.0 / np.log(_MAX_SIGMA / _MIN_SIGMA)  # of 3 %
 
 
-@dataclass(frozen=True)
-class Patch:
-    """Features of a map around a place."""
-
-    local: Floats32  # (C, h, w) of unit norm, zero without map data; cells of 1 m
-    sigma: Floats32  # (h, w) uncertainty of each cell as a keypoint; meaningless where local is zero
-    corner: Floats  # (2,) x and y of the lower corner of cell (0, 0), metres, map frame
-
-
 class FeatureMap:
     """Learned features of a base map: its arrays ``learned.*``, which may be memory-mapped.
 
     Attributes:
         weights: :func:`weights_sha256` of the networks that computed them.
-        index: look-up of the tiles.
+        index: numbers of the tiles.
         place: (K, P) int8 global descriptors times 127.
         place_at: (K, 2) float32 centres of their surroundings, metres, map frame.
 
@@ -105,19 +95,6 @@ class FeatureMap:
     def tile_centres(self) -> Floats:
         """(T, 2) centres of the tiles, metres, map frame."""
         return np.asarray((self.index.tiles + 0.5) * (TILE * LOCAL_CELL), dtype=np.float64)
-
-    def patch(self, centre: Reals, reach: float) -> Patch:
-        """Return the features within ``reach`` metres of ``centre`` (x and y, map frame), out to whole cells."""
-        middle = np.asarray(centre, dtype=np.float64)[:2]
-        low = np.floor((middle - reach) / LOCAL_CELL).astype(np.int64)
-        high = np.ceil((middle + reach) / LOCAL_CELL).astype(np.int64)
-        width, height = (int(n) for n in high - low)
-        local = np.zeros((height, width, self.dimensions), dtype=np.int8)
-        sigma = np.full((height, width), 255, dtype=np.uint8)
-        self.index.gather(self._local, low, local)
-        self.index.gather(self._sigma, low, sigma)
-        vectors = np.ascontiguousarray(dequantized(local).transpose(2, 0, 1))
-        return Patch(vectors, dequantized_sigma(sigma), np.asarray(low * LOCAL_CELL, dtype=np.float64))
 
     def sample(self, tiles: int) -> Floats32:
         """Return the features (C, N) of the cells of at most ``tiles`` tiles, evenly spread."""
@@ -190,35 +167,14 @@ def quantized_sigma(sigma: Floats32) -> npt.NDArray[np.uint8]:
     return np.asarray(np.rint(steps), dtype=np.uint8)
 
 
-def dequantized_sigma(sigma: npt.NDArray[np.uint8]) -> Floats32:
-    """Undo :func:`quantized_sigma`."""
-    return np.asarray(_MIN_SIGMA * np.exp(sigma / _STEPS), dtype=np.float32)
-
-
 class TileIndex:
-    """Look-up of tiles by position, built from tile numbers (T, 2), column (x) and row (y)."""
+    """Tile numbers (T, 2), column (x) and row (y), and the rectangle around them."""
 
     def __init__(self, tiles: npt.NDArray[np.int32]) -> None:
         self.tiles = np.array(tiles, dtype=np.int64).reshape(-1, 2)
         self.low = self.tiles.min(axis=0) if len(self.tiles) else np.zeros(2, dtype=np.int64)
         high = self.tiles.max(axis=0) + 1 if len(self.tiles) else self.low
         self.columns, self.rows = (int(n) for n in high - self.low)
-        self._number = np.full((self.rows, self.columns), -1, dtype=np.int64)
-        self._number[tuple((self.tiles - self.low).T[::-1])] = np.arange(len(self.tiles))
-
-    def gather(self, values: npt.NDArray[Any], corner: Ints, out: npt.NDArray[Any]) -> None:
-        """Copy ``values`` (T, 32, 32, ...) from cell ``corner`` (x, y) into ``out`` (h, w, ...)."""
-        height, width = out.shape[:2]
-        first = np.floor_divide(corner, TILE) - self.low
-        last = np.floor_divide(corner + np.array([width - 1, height - 1]), TILE) - self.low
-        for row in range(max(0, int(first[1])), min(self.rows - 1, int(last[1])) + 1):
-            for column in range(max(0, int(first[0])), min(self.columns - 1, int(last[0])) + 1):
-                number = self._number[row, column]
-                if number >= 0:
-                    x, y = (np.array([column, row]) + self.low) * TILE - corner
-                    to_x, of_x = _overlap(int(x), TILE, width)
-                    to_y, of_y = _overlap(int(y), TILE, height)
-                    out[to_y, to_x] = values[number, of_y, of_x]
 
 
 def _overlap(begin: int, length: int, size: int) -> tuple[slice, slice]:

@@ -13,7 +13,7 @@ import numpy as np
 import numpy.typing as npt
 
 from coview_stream.config.node import NodeConfig
-from coview_stream.errors import EncodingError, MessageError
+from coview_stream.errors import MessageError
 from coview_stream.geometry.transforms import Points, Pose
 from coview_stream.messages import CLOUD_CODECS, ODOMETRY_CODECS, decode_cloud, decode_odometry, prepare
 from coview_stream.messages.choose import MessageKind, codec_for
@@ -183,7 +183,7 @@ def _readable_as(codecs: Mapping[str, Any], decode: Callable[..., Any], sample: 
     for name in sorted(codecs, key=lambda name: name in ("xyzi", "xyz")):
         try:
             message = decode(sample, name, None)
-        except (EncodingError, MessageError):
+        except MessageError:
             continue
         if isinstance(message, OdometryMessage):
             return name

@@ -38,7 +38,7 @@ PIVOT, MEAN, BELIEF, FIRST = 12, 15, 27, 63
 RADIUS, WIDTH, SHIFT, TURN, POINTS, KEEP, EACH = 0, 1, 2, 3, 4, 5, 6
 # state: pose by rows (12), then these, the information (36), the sums of a step (30), and six working values
 SCALE, ROUND, TOTAL, STATUS, CONVERGED, INFORMATION, SUMS, OFF = 12, 13, 14, 15, 16, 17, 53, 83
-RUNNING, DONE, LOST = 0, 1, 2
+DONE, LOST = 1, 2  # statuses; 0 while it goes on
 
 
 @ti.func

@@ -14,7 +14,7 @@ from coview_stream.localization.calibration.calibration import Calibration
 from coview_stream.localization.result import KeyframeEvidence
 from coview_stream.localization.search.consensus import Hypothesis
 from coview_stream.localization.search.hints import FROM_THERE
-from coview_stream.localization.search.places import Rivals, Scored
+from coview_stream.localization.search.places import Scored
 from coview_stream.localization.search.request import FIRST_EPOCH, Epoch, SearchRequest
 from coview_stream.localization.state import State
 
@@ -60,7 +60,7 @@ class SearchResult:
     evidence: KeyframeEvidence  # of the most probable place, with the resulting state and the reason
     travelled: float = 0.0  # metres that odometry had driven at the keyframe
     epoch: Epoch = FIRST_EPOCH  # of the request
-    rivals: Rivals = field(default_factory=Rivals)  # all scored places of the keyframe
+    rivals: int = 0  # number of distinct places of the keyframe
     # (4, 4) T_map_odom of the most probable place, registered if that succeeded, levelled by the newest frame alone;
     # None without any place
     leader: Pose | None = None
@@ -123,8 +123,8 @@ def _verdict(scored: Scored, leader: Hypothesis | None, rule: AcceptanceConfig, 
     if scored.none > 0.5:
         if scored.by_chance < 1.5:
             return State.SEARCHING, "no place stands out: the best fits no better than chance would have it"
-        if scored.by_chance > 0.5 * len(scored.rivals):
-            return State.SEARCHING, f"no place stands out: none of {len(scored.rivals)} fits better than chance"
+        if scored.by_chance > 0.5 * scored.rivals:
+            return State.SEARCHING, f"no place stands out: none of {scored.rivals} fits better than chance"
         return State.SEARCHING, f"no place stands out: {scored.by_chance:.0f} places would fit as well by chance"
     best, second = scored.places[0], scored.second
     if second is not None and second.probability > scored.none:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -16,25 +16,10 @@ BASIN_DISTANCE, BASIN_ANGLE = SAME_DISTANCE, float(np.radians(15.0))
 
 
 @dataclass(frozen=True)
-class Rivals:
-    """All distinct places of one keyframe, best score first."""
-
-    T_map_odom: Floats = field(default_factory=lambda: np.empty((0, 4, 4)))  # (N, 4, 4)
-    # (N,) float32 evidence scores in [0, 1]; the best from four times as many points
-    scores: Floats32 = field(default_factory=lambda: np.empty(0, dtype=np.float32))
-    # (N,) float32 shares of the scan in the surveyed area
-    inside: Floats32 = field(default_factory=lambda: np.empty(0, dtype=np.float32))
-
-    def __len__(self) -> int:
-        """Return the number of places N."""
-        return len(self.scores)
-
-
-@dataclass(frozen=True)
 class Scored:
     """Scores of a keyframe's hypotheses."""
 
-    rivals: Rivals  # all places
+    rivals: int  # number of distinct places
     places: list[Hypothesis]  # followed places, most probable first; then those that only the map names
     error: float = 1.0  # probability that the robot is not at the first place
     none: float = 1.0  # probability that it is at no place of the map

@@ -39,7 +39,7 @@ from coview_stream.localization.evidence.observation import Observations, Observ
 from coview_stream.localization.evidence.open_places import SIGHT, OpenPlaces
 from coview_stream.localization.evidence.paths import Paths, look_back
 from coview_stream.localization.search.consensus import Hypothesis
-from coview_stream.localization.search.places import BASIN_ANGLE, BASIN_DISTANCE, Rivals, Scored, apart, grouped, same
+from coview_stream.localization.search.places import BASIN_ANGLE, BASIN_DISTANCE, Scored, apart, grouped, same
 from coview_stream.localization.search.request import SAME_ANGLE, SAME_DISTANCE
 
 _PROMISING = 96  # best hypotheses that are looked up with many points
@@ -177,14 +177,13 @@ class PlaceScorer:
             replace(place, score=float(observed.scores[row]), ratio=ratio, probability=probability)
             for place, (ratio, probability, row) in zip(followed.hypotheses, numbers, strict=True)
         ]
-        rivals = Rivals(scan.transforms(observed.poses[first]), observed.scores[first], observed.inside[first])
         if not places:
-            return Scored(rivals, places)
+            return Scored(len(first), places)
         poses = scan.poses(np.array([place.T_map_odom for place in places]))
         elsewhere = apart(poses, poses[0], BASIN_DISTANCE, BASIN_ANGLE)
         second = next((place for place, other in zip(places, elsewhere, strict=True) if other), None)
         by_chance = expected_by_chance(places[0].ratio, len(first))
-        return Scored(rivals, places, chances.error(~elsewhere), chances.none, by_chance, second)
+        return Scored(len(first), places, chances.error(~elsewhere), chances.none, by_chance, second)
 
     def beside_leader(self, T_map_odom: Floats, scan: ObservedScan) -> list[Hypothesis]:
         """Return those of further places (H, 4, 4) that are not scored yet, with their odds against the leader.

@@ -13,7 +13,7 @@ from coview_stream.geometry.transforms import inverse, pose_from, rot_z
 from coview_stream.localization.evidence.observation import Evidence
 from coview_stream.localization.search.acceptance import SearchResult, decide
 from coview_stream.localization.search.consensus import Hypothesis
-from coview_stream.localization.search.places import Rivals, Scored
+from coview_stream.localization.search.places import Scored
 from coview_stream.localization.search.request import SearchRequest
 
 
@@ -85,9 +85,7 @@ def judged(*places, error=None, by_chance=1e-3, leader=True, risk=RULE.risk, und
     none = 1.0 - sum(each.probability for each in places)
     if error is None:
         error = 1.0 - places[0].probability if places else 1.0
-    some = np.array([each.score for each in places], dtype=np.float32)
-    T = np.array([each.T_map_odom for each in places]).reshape(-1, 4, 4)
     second = places[1] if len(places) > 1 else None
-    scored = Scored(Rivals(T, some, some), list(places), error, none, by_chance, second)
+    scored = Scored(len(places), list(places), error, none, by_chance, second)
     best = candidate(places[0]) if leader and places else None
     return decide(scored, best, REQUEST, AcceptanceConfig(risk=risk), undecided)

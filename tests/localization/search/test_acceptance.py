@@ -13,7 +13,7 @@ from coview_stream.geometry.transforms import Circle, pose_from, rot_z
 from coview_stream.localization.search.acceptance import BY_FEATURES, IN_CIRCLE, MAX_PLACES, Considered, decide
 from coview_stream.localization.search.consensus import Hypothesis
 from coview_stream.localization.search.hints import FROM_THERE
-from coview_stream.localization.search.places import Rivals, Scored
+from coview_stream.localization.search.places import Scored
 from coview_stream.localization.state import State
 
 
@@ -85,7 +85,7 @@ def test_evidence_says_what_the_decision_rests_on():
     assert said.confidence == pytest.approx(1 - 0.5e-4, abs=1e-12)
     assert said.by_chance == 2.5e-7
     assert said.reason == "found: wrong 1 in 20,000"
-    assert len(result.rivals) == 2
+    assert result.rivals == 2
     json.dumps(said.to_json(), allow_nan=False)
     # without one it is the field's
     assert judged(best, rival, leader=False).evidence.score == 0.6
@@ -126,11 +126,11 @@ def test_hint_alone_is_not_accepted_before_votes_have_named_rivals():
 
 def test_reason_says_that_a_circle_was_searched_unless_there_is_a_pose():
     request = replace(REQUEST, area=Circle(0.0, 0.0, 80.0))
-    scored = Scored(Rivals(), [], error=1.0)
+    scored = Scored(0, [], error=1.0)
     assert decide(scored, None, request, AcceptanceConfig()).evidence.reason.endswith(IN_CIRCLE)
     assert not decide(scored, None, REQUEST, AcceptanceConfig()).evidence.reason.endswith(IN_CIRCLE)
     best = place(1.0)
-    found = decide(Scored(Rivals(), [best], error=1e-9, none=0.0), candidate(best), request, AcceptanceConfig())
+    found = decide(Scored(0, [best], error=1e-9, none=0.0), candidate(best), request, AcceptanceConfig())
     assert found.evidence.state is State.TRACKING
     assert IN_CIRCLE not in found.evidence.reason
 
@@ -140,8 +140,8 @@ def test_the_most_probable_come_first_in_the_frame_of_the_sources():
         Hypothesis(pose_from(rot_z(0.5), [k, 2.0, 3.0]), 1, 1, score=0.5, ratio=7.0, probability=0.01 * k)
         for k in range(30)
     ]
-    scored = Scored(Rivals(), places, none=0.25)
+    scored = Scored(0, places, none=0.25)
     found = Considered.of(scored, search_request(4.0), np.array([1000.0, 0.0, 50.0]))
     assert (found.stamp, found.none, len(found.places)) == (4.0, 0.25, MAX_PLACES)
     assert np.allclose(found.places[0], [1029.0, 2.0, 53.0, 0.5, 0.29, 7.0])
-    assert Considered.of(Scored(Rivals(), []), search_request(), np.zeros(3)) is None
+    assert Considered.of(Scored(0, []), search_request(), np.zeros(3)) is None

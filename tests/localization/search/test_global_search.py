@@ -207,7 +207,7 @@ def test_good_place_is_observed_again_without_votes(never_sure, world_drive):
     assert again.evidence.station == first.evidence.station
     never_sure.clear()
     nothing = never_sure.update(next(frames))
-    assert (nothing.evidence.score, nothing.evidence.state, len(nothing.rivals)) == (0.0, State.SEARCHING, 0)
+    assert (nothing.evidence.score, nothing.evidence.state, nothing.rivals) == (0.0, State.SEARCHING, 0)
 
 
 def test_every_start_of_a_search_is_another_chance_until_a_place_is_accepted(search, never_sure, world_drive):
@@ -238,13 +238,13 @@ def test_search_whose_clouds_are_levelled_anew_goes_on_with_its_earlier_keyframe
 def test_request_of_another_epoch_or_an_acceptance_starts_anew(search, never_sure, world_drive):
     never_sure.update(next(run_of(world_drive, 1)))
     name_instead(never_sure)
-    assert len(never_sure.update(next(run_of(world_drive, 1, epoch=Epoch(1, 0)))).rivals) == 0
+    assert never_sure.update(next(run_of(world_drive, 1, epoch=Epoch(1, 0)))).rivals == 0
     assert len(never_sure.coview.consensus) == 1
     frames = run_of(world_drive, 2)
     assert search.update(next(frames)).accepted is not None
     assert len(search.coview.consensus) == 0
     name_instead(search)
-    assert len(search.update(next(frames)).rivals) == 0
+    assert search.update(next(frames)).rivals == 0
 
 
 def test_wrong_place_is_observed_again_and_never_accepted(search, world_drive):
@@ -255,23 +255,8 @@ def test_wrong_place_is_observed_again_and_never_accepted(search, world_drive):
     name_instead(search)
     for frame in frames:
         again = search.update(frame)
-        assert len(again.rivals) >= 1
+        assert again.rivals >= 1
         assert again.accepted is None
-
-
-def test_result_carries_all_distinct_places_that_were_scored(search, world_drive):
-    result = search.update(next(run_of(world_drive, 1)))
-    rivals = result.rivals
-    assert len(rivals) > 20
-    rank = rivals.scores * rivals.inside
-    assert (np.diff(rank) <= 0).all()
-    assert off(rivals.T_map_odom[0]) < 0.6
-    assert rank[0] > 2 * rank[1]
-    robot = rivals.T_map_odom @ np.append(next(run_of(world_drive, 1)).position, 1.0)
-    gap = np.linalg.norm(robot[:, None] - robot[None], axis=2)
-    yaw = np.arctan2(rivals.T_map_odom[:, 1, 0], rivals.T_map_odom[:, 0, 0])
-    turn = np.abs((yaw[:, None] - yaw[None] + np.pi) % (2 * np.pi) - np.pi)
-    assert ((gap >= 2.0) | (turn >= np.radians(5.0)) | np.eye(len(rivals), dtype=bool)).all()
 
 
 def with_leaning_odometry(world_map, world_drive, gravity_sigma, max_tilt):

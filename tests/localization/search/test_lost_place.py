@@ -11,7 +11,7 @@ from trackers import observed
 from coview_stream.config import LocalizerConfig
 from coview_stream.geometry.transforms import inverse, pose_from, rot_z
 from coview_stream.localization.search.lost_place import weighed_by_odometry
-from coview_stream.localization.search.places import Rivals, Scored
+from coview_stream.localization.search.places import Scored
 from coview_stream.localization.search.request import LostPlace
 from coview_stream.localization.state import State
 
@@ -40,7 +40,7 @@ def weighed(world_map, request, others=(), alone=0.1):
     second = place(0.5 * alone, pose_from(np.eye(3), [50.0, 0.0, 0.0]) @ T_MAP_ODOM)
     places = [place(1.0 - alone - sum(each.probability for each in others), T_MAP_ODOM), *others, second]
     error = alone + sum(each.probability for each in others)
-    scored = Scored(Rivals(), places, error, 0.5 * alone, 1e-3, places[1])
+    scored = Scored(0, places, error, 0.5 * alone, 1e-3, places[1])
     scans = [observed(request.cloud, request.T_odom_body)]
     out = weighed_by_odometry(scored, candidate(places[0]), request, scans, world_map, LocalizerConfig(), Silent())
     assert out.none + sum(each.probability for each in out.places) == pytest.approx(1.0)

@@ -14,7 +14,7 @@ from coview_stream.localization.evidence.observation import ObservedScan
 from coview_stream.localization.evidence.paths import look_back
 from coview_stream.localization.registration.clouds import prepare_scan
 from coview_stream.localization.search.consensus import Hypothesis
-from coview_stream.localization.search.places import Rivals, Scored
+from coview_stream.localization.search.places import Scored
 from coview_stream.localization.search.scoring import PlaceScorer
 
 ODOM = pose_from(rot_z(-0.7), [12.0, 40.0, 3.0])  # map <- odometry
@@ -69,14 +69,12 @@ def test_hypotheses_near_the_right_place_become_one_and_keep_votes(scorer, scan)
     ]
     far = hypothesis(off(9.0, -7.0, 120.0, scan), station=8)
     result = scored(scorer, [far, *near], scan)
-    assert len(result.rivals) == len(result.places) == 2
+    assert result.rivals == len(result.places) == 2
     best, other = result.places
     assert is_right(best, scan)
     assert (best.station, other.station) == (3, 8)
     assert best.ratio > other.ratio
     assert result.second is other
-    np.testing.assert_array_equal(result.rivals.T_map_odom[0], best.T_map_odom)
-    assert result.rivals.scores.tolist() == pytest.approx([best.score, other.score])
 
 
 def test_best_places_are_moved_once_more_with_many_points(world_map, world_drive):
@@ -129,14 +127,14 @@ def test_hint_is_no_better_than_a_vote(world_map, scan):
 
 def test_scan_without_structure_or_hypotheses_is_found_nowhere(scorer, scan, world_drive):
     none = scored(scorer, [], scan)
-    assert len(none.rivals) == 0
+    assert none.rivals == 0
     assert none.places == []
     assert (none.error, none.none) == (1.0, 1.0)
     ground, settings = scan.cloud.points[~scan.cloud.above], LocalizerConfig().registration
     flat = ObservedScan.of(prepare_scan(ground, scan.body, settings), world_drive.clouds[0], scan.T_odom_body)
     scorer.clear()
     result = scored(scorer, [hypothesis(ODOM)], flat)
-    assert result.rivals.scores.tolist() == [0.0]
+    assert [place.score for place in result.places] == [0.0]
     assert result.error > 1e-2
 
 
@@ -169,10 +167,11 @@ def test_hypotheses_beside_the_leader_are_tried(world_map, world_drive):
     """Along a corridor the robot may be anywhere: what lies beside the best place is its rival."""
     scorer = PlaceScorer(world_map)
     scan = scan_of(world_drive, 0)
-    assert len(scored(scorer, [hypothesis(ODOM)], scan).rivals) == 1
-    rivals = scored(scorer, [], scan).rivals
-    assert len(rivals) > 3
-    gap = np.linalg.norm((rivals.T_map_odom - ODOM) @ np.append(scan.T_odom_body[:3, 3], 1.0), axis=1)
+    assert scored(scorer, [hypothesis(ODOM)], scan).rivals == 1
+    result = scored(scorer, [], scan)
+    assert result.rivals > 3
+    poses = np.array([place.T_map_odom for place in result.places])
+    gap = np.linalg.norm((poses - ODOM) @ np.append(scan.T_odom_body[:3, 3], 1.0), axis=1)
     assert 2.0 < np.sort(gap)[1] < 12.0
 
 
@@ -241,7 +240,7 @@ def test_two_readings_of_a_scan_are_weighed_by_their_prior(world_map, world_driv
 def test_places_that_the_map_names_share_the_probability_by_their_odds():
     T = np.eye(4)
     first, other = Hypothesis(T, 1, probability=0.6), Hypothesis(T, 2, probability=0.3)
-    before = Scored(Rivals(), [first, other], error=0.4, none=0.1, second=other)
+    before = Scored(0, [first, other], error=0.4, none=0.1, second=other)
     after = before.beside([Hypothesis(T, probability=0.5), Hypothesis(T, probability=2.0)])
     assert [place.probability for place in after.places] == pytest.approx([0.24, 0.12, 0.12, 0.48])
     assert (after.error, after.none) == pytest.approx((0.76, 0.04))
