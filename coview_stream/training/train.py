@@ -120,29 +120,29 @@ def train_session(
     for path, world in zip(paths, worlds, strict=True):
         if world.recipe["recipe"] != json.loads(json.dumps(asdict(plan.recipe))):
             raise InputError(f"{path}: a world of another recipe; choose another folder, or delete it")
-    history: list[list[float]] = []
+    history: dict[int, list[float]] = {}  # by step; a resumed training has none of those before
 
     def report(step: int, loss: Any) -> None:
-        history.append([float(x.detach()) for x in (loss.dense, loss.local, loss.place)] + [loss.recall])
+        history[step] = [float(x.detach()) for x in (loss.dense, loss.local, loss.place)] + [loss.recall]
         if (step + 1) % _REPORT_STEPS == 0:
-            dense, local, place, found_share = np.mean(history[-_REPORT_STEPS:], axis=0)
+            dense, local, place, found_share = np.mean([*history.values()][-_REPORT_STEPS:], axis=0)
             say(f"step {step + 1}: dense {dense:.3f}, local {local:.3f}, place {place:.3f}, recall {found_share:.2f}")
 
     net = train(worlds[: plan.worlds], plan.training, report, out / "checkpoint.pt")
     say("evaluating")
     recall = evaluate(worlds[plan.worlds :], encoder(net, "aerial"), encoder(net, "ground"), plan.most)
-    card = {
+    card: dict[str, Any] = {
         "version": __version__,
         "torch": str(torch.__version__),
         "plan": asdict(plan),
         "data_sha256": _digest(worlds[: plan.worlds]),
         "threads": int(torch.get_num_threads()),
         "parameters": sum(p.numel() for p in net.parameters()),
-        "loss": {"first": history[0][0], "last": float(np.mean([row[0] for row in history[-_REPORT_STEPS:]]))}
-        if history
-        else {},
+        "loss": {"first": history[0][0]} if 0 in history else {},
         "validation": recall,
     }
+    if history:
+        card["loss"]["last"] = float(np.mean([row[0] for row in [*history.values()][-_REPORT_STEPS:]]))
     export(net, out, card)
     return card
 

@@ -1,6 +1,6 @@
 """A minute's training of tiny networks: the loss falls, and places are found far more often than by chance."""
 
-from dataclasses import replace
+from dataclasses import asdict, replace
 from pathlib import Path
 
 import numpy as np
@@ -8,10 +8,13 @@ import pytest
 
 pytest.importorskip("torch", reason="training needs PyTorch: pip install '.[learn-train]'")
 
+import torch
+
 from coview_stream.cli import main
 from coview_stream.descriptors.birds_eye_view import LAYERS
 from coview_stream.descriptors.network import Network
 from coview_stream.errors import InputError
+from coview_stream.training.networks import PlaceNet
 from coview_stream.training.train import SMOKE, train_session
 
 
@@ -28,11 +31,16 @@ def test_smoke_training_learns_to_find_places(tmp_path: Path) -> None:
         assert (features.sigma > 0).all()
 
 
-def test_resuming_with_other_settings_is_refused(tmp_path: Path) -> None:
+def test_training_resumes_with_its_own_settings_alone_and_tells_no_first_loss(tmp_path: Path) -> None:
     """Where a training of one step has been, another seed, width or recipe does not go on with it."""
     short = replace(SMOKE, worlds=1, most=2, training=replace(SMOKE.training, steps=1, pieces=1))
     train_session(tmp_path, short)
     assert not (tmp_path / "checkpoint.pt").exists()  # too short for one
+    config = replace(short.training, steps=2)
+    net = PlaceNet(config.width)
+    state = {"net": net.state_dict(), "optimiser": torch.optim.AdamW(net.parameters()).state_dict()}
+    torch.save(state | {"step": 1, "config": asdict(config)}, tmp_path / "checkpoint.pt")
+    assert train_session(tmp_path, replace(short, training=config))["loss"].keys() == {"last"}
     with pytest.raises(InputError, match="another recipe"):
         train_session(tmp_path, replace(short, recipe=replace(SMOKE.recipe, rays=50_000)))
     (tmp_path / "checkpoint.pt").write_bytes(b"no checkpoint")
