@@ -52,6 +52,17 @@ def test_transform_maps_source_to_target_in_dtype_of_points():
     assert g.transform(T_map_body, np.empty((0, 3), np.float32)).shape == (0, 3)
 
 
+@pytest.mark.parametrize("count", [g._ROWS - 1, g._ROWS, 2 * g._ROWS + 1])
+def test_transform_of_many_points_is_that_of_all_at_once(count: int):
+    T = g.pose_from(g.rot_z(0.7), [400.0, 2.0, 3.0])
+    points = np.random.default_rng(0).uniform(-80.0, 80.0, (count, 3))
+    np.testing.assert_allclose(g.transform(T, points), points @ T[:3, :3].T + T[:3, 3], rtol=1e-12, atol=1e-10)
+    near = g.transform(T, points.astype(np.float32))
+    assert near.dtype == np.float32
+    np.testing.assert_allclose(near, g.transform(T, points), atol=1e-3)
+    assert 9 * g._ROWS < 262_144  # products from which OpenBLAS starts threads
+
+
 @pytest.mark.parametrize("turn", [0.0, 1e-9, 1e-4, 1.0, np.pi / 2, 3.0, np.pi])
 def test_rotation_angle_is_exact_near_zero_and_pi(turn):
     assert g.rotation_angle(g.pose_from(g.rot_z(turn), [9, 9, 9])) == pytest.approx(turn, rel=1e-6, abs=1e-12)
