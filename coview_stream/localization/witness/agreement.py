@@ -103,6 +103,17 @@ def _wrong(step: Step, seen: Seen) -> float:
     return density if step.start is None else 0.5 * (density + anywhere(seen, step.start))
 
 
+def registered_rightly(step: Step, motion: Floats, spread: Floats) -> float:
+    """Return the probability that a step's clouds, which it has, are registered rightly.
+
+    ``motion`` (3,) is expected, with covariance ``spread`` (3, 3).
+    """
+    assert step.clouds is not None
+    seen = step.clouds
+    rightly = (1.0 - step.fails) * float(normal(seen.motion - motion, seen.covariance + spread))
+    return rightly / (rightly + step.fails * _wrong(step, seen))
+
+
 def at_once(step: Step, covariance: Floats) -> float:
     """Return the likelihood that clouds left odometry's motion at one moment: in another part of the step both agree.
 

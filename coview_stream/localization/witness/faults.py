@@ -8,14 +8,15 @@ three agree if nothing is wrong. Each fault makes them disagree in its own way:
 * stopped: o = 0 at any l; l is smooth.
 * scaled: l = s o along the path, with the right heading; l is right.
 * repeated: l = 0 at any o.
-* late: l = o at an earlier time. The lag is constant, or grows irregularly or steadily.
+* late: l = o at an earlier time. The lag is constant, or grows unevenly or, with a drifting clock, evenly.
 * moved: the sensor was turned or shifted on the body by C, or the clouds come in another frame. Once l = o C, which no
   body does, and from then on l = C^-1 o C.
 * mixed: clouds of two places; half of the time l is arbitrary, and most such clouds do not fit each other.
 
 Each registration fails with a small probability and is then arbitrary. A hidden Markov model gives the probabilities:
 those before the step, moved by the rates at which faults start and end, times the likelihood of l and m (forward
-algorithm). Each lag on a grid is a state; each step starts hypotheses about C, s and a clock's drift; the best stay.
+algorithm). Each lag on a grid is a state; each step starts hypotheses about C, s and a clock's drift; the best stay. A
+Kalman filter estimates the lag and the rate of each drifting clock.
 """
 
 from __future__ import annotations
@@ -28,6 +29,7 @@ import numpy as np
 
 from coview_stream.geometry.arrays import Floats
 from coview_stream.geometry.planar import between, compose, inverted
+from coview_stream.geometry.transforms import wrap_angle
 from coview_stream.localization.tracking.monitor import RejectionReason
 from coview_stream.localization.witness.agreement import (
     ANYWHERE,
@@ -38,6 +40,7 @@ from coview_stream.localization.witness.agreement import (
     likelihood,
     normal,
     of_several_places,
+    registered_rightly,
     unsure,
 )
 
@@ -76,6 +79,7 @@ _CHANGES = (  # sigmas of C: a mount gives way, a frame with another origin, one
 _SCALES = 0.5  # sigma of wrong scales of odometry: tyres, gears, units of half the size
 _KEPT = 5  # kept hypotheses about each of C, scales and drifting clocks
 _EXACT = np.zeros((3, 3))
+_NEXT = 0.01  # seconds, step of the numerical derivatives by lag
 _ON_BODY = 2.0  # metres, largest shift of a sensor on its mount
 _TURNED = math.radians(2.0)  # of C, from which it is called a turn
 _NEGLIGIBLE = 1e-6  # probability below which a fault has not started
@@ -113,44 +117,64 @@ class _Scaled:
 class _Parting:
     """Hypothesis that the clouds' clock has drifted from odometry's since a step: their lag grows at a constant rate.
 
-    On a straight path at constant speed it looks like odometry out of scale. Turns separate the two, and so do the
-    stamps, whose correct spacing is the lidar's period.
+    Each step's clouds correct lag and rate (a Kalman filter). On a straight path at constant speed it looks like
+    odometry out of scale. Turns separate the two, and so do the stamps, whose correct spacing is the lidar's period.
     """
 
     weight: float
-    rate: float  # seconds per second
-    sigma: float
     lag: float  # seconds
-    seconds: float = 0.0  # since its start
+    rate: float  # seconds per second
+    covariance: Floats  # (2, 2) of both
 
     def beyond(self, lag: float) -> float:
         """Return the probability, under the hypothesis, that the clouds are off by over ``lag`` seconds either way."""
-        sigma = math.sqrt(2.0) * max(self.sigma * self.seconds, float(LAGS[1]) / 2.0)
+        sigma = math.sqrt(2.0) * max(math.sqrt(float(self.covariance[0, 0])), float(LAGS[1]) / 2.0)
         return 1.0 - 0.5 * (math.erf((lag - self.lag) / sigma) + math.erf((lag + self.lag) / sigma))
 
-    def expected(self, step: Step) -> tuple[Floats, Floats]:
-        """Return the clouds' motion (3,) over a step, and its covariance (3, 3)."""
-        o, later = step.odometry.motion, self.lag + self.rate * step.seconds
-        along = o * self.sigma
-        spread = step.odometry.covariance + np.outer(along, along)
-        if later > LAGS[-1]:  # odometry of so long ago is forgotten
-            return o * [1.0 - self.rate, 1.0 - self.rate, 1.0], spread
-        before, now = (
-            np.array([np.interp(lag, LAGS, column) for column in path.T])
-            for path, lag in ((step.path_before, self.lag), (step.path_now, later))
-        )
-        if step.unsure is not None:
-            ends = zip((self.lag, later), step.unsure, strict=True)
-            spread = spread + hidden_by(np.asarray(np.linalg.norm([np.interp(lag, LAGS, row) for lag, row in ends])))
-        return between(before, now), spread
+    def after(self, step: Step, stays: float) -> _Parting:
+        """Return the hypothesis after a step, over which it lasts with the probability ``stays``.
 
-    def after(self, step: Step, likelihood: float) -> _Parting:
-        """Return the hypothesis after a step with a ``likelihood`` of its motions."""
-        longer, sigma = self.rate * step.seconds, self.sigma * step.seconds
-        allowed = 1.0 if step.stamps is None else float(step.stamps.allow(np.array(longer), sigma))
-        return replace(
-            self, weight=self.weight * likelihood * allowed, lag=self.lag + longer, seconds=self.seconds + step.seconds
-        )
+        The map and the stamps count in its weight, but do not correct it.
+        """
+        lag, P, o = self.lag, self.covariance, step.odometry.motion
+        later = lag + self.rate * step.seconds
+        if max(lag, later) + _NEXT > LAGS[-1]:  # odometry of so long ago is forgotten
+            motion = o * [1.0 - self.rate, 1.0 - self.rate, 1.0]
+            J = np.outer([-o[0], -o[1], 0.0], [0.0, 1.0])
+        else:
+            motion = _between_lags(step, lag, later)
+            others = (_between_lags(step, lag + start, later + _NEXT) - motion for start in (_NEXT, 0.0))
+            by_lag, by_growth = (np.append(d[:2], wrap_angle(float(d[2]))) / _NEXT for d in others)
+            J = np.column_stack([by_lag, by_growth * step.seconds])
+        noise = step.odometry.covariance
+        if step.unsure is not None:
+            ends = zip((lag, later), step.unsure, strict=True)
+            noise = noise + hidden_by(np.asarray(np.linalg.norm([np.interp(at, LAGS, row) for at, row in ends])))
+        spread = noise + J @ P @ J.T
+        weight = self.weight * stays * float(likelihood(step, motion, spread))
+        state = np.array([lag, self.rate])
+        if step.clouds is not None:
+            sure = max(registered_rightly(step, motion, spread), _NEGLIGIBLE)
+            R = (step.clouds.covariance + noise) / sure + (1.0 / sure - 1.0) * J @ P @ J.T
+            gain = np.linalg.solve(J @ P @ J.T + R, J @ P).T
+            gap = step.clouds.motion - motion
+            gap[2] = wrap_angle(float(gap[2]))
+            rest = np.eye(2) - gain @ J
+            state, P = state + gain @ gap, rest @ P @ rest.T + gain @ R @ gain.T
+        if step.stamps is not None:
+            longer, sigma = state[1] * step.seconds, math.sqrt(float(P[1, 1])) * step.seconds
+            weight *= float(step.stamps.allow(longer, sigma))
+        F = np.array([[1.0, step.seconds], [0.0, 1.0]])
+        lag, rate = (F @ state).tolist()
+        # over a long pause nothing is known of it, and a clock that is ahead says the same as a right one
+        weight *= step.seconds * _FASTEST < LAGS[-1] and lag > -LAGS[1]
+        return _Parting(weight, lag, rate, F @ P @ F.T)
+
+
+def _between_lags(step: Step, before: float, now: float) -> Floats:
+    """Return odometry's motion (3,) over a step, late by ``before`` seconds at its start and by ``now`` at its end."""
+    ends = (step.path_before, before), (step.path_now, now)
+    return between(*(np.array([np.interp(lag, LAGS, column) for column in path.T]) for path, lag in ends))
 
 
 class Accusation(NamedTuple):
@@ -279,11 +303,15 @@ class FaultPosterior:
             scaled.append(h)
         scaled = sorted(scaled, key=lambda h: -h.weight)[:_KEPT]
 
-        # and a drifting clock continues to drift
-        parting = [h.after(step, grips * float(like(*h.expected(step)))) for h in self.parting]
+        # a drifting clock drifts on until it is set, or stays as late as it is
+        parting = [h.after(step, stays) for h in self.parting]
+        for h in self.parting:
+            at = min(max(round(h.lag / float(LAGS[1])), 0), len(LAGS) - 2)
+            steady[0] += 0.5 * ends * h.weight * pairs[at, 0]
+            steady[at] += 0.5 * ends * h.weight * pairs[at, at]
         if step.clouds is not None and not stands and 0.0 < 1.0 - scale < _FASTEST:
-            new = _Parting(come * (good + slip) * sigma / _FASTEST, 1.0 - scale, sigma, 0.0)
-            parting.append(new.after(step, float(like(*new.expected(step)))))
+            new = _Parting(come * (good + slip), 0.0, 0.0, np.diag([0.0, (0.5 * _FASTEST) ** 2]))
+            parting.append(new.after(step, 1.0))
         parting = sorted(parting, key=lambda h: -h.weight)[:_KEPT]
 
         others = new_slip + new_repeated + new_mixed + new_stopped + steady.sum() + growing.sum()
@@ -337,7 +365,7 @@ class FaultPosterior:
         for h in self.moved:
             h.C = compose(h.C, inverted(D))
         for parting in self.parting:
-            parting.lag -= delay
+            parting.lag = max(parting.lag - delay, 0.0)
         if delay:
             for lags in (self.steady, self.growing):
                 shares, place = lags.copy(), np.clip((LAGS - delay) / float(LAGS[1]), 0.0, len(LAGS) - 1.0)
@@ -382,7 +410,8 @@ class FaultPosterior:
             longest = min(metres / max(speed, 1e-9), radians / max(turning, 1e-9))  # longest lag of a right pose
             share = sum(h.weight * h.beyond(longest) for h in self.parting)
             best = max(self.parting, key=lambda h: h.weight)
-            words = f"clouds are {best.lag:.1f} s older than their stamps and more and more"
+            grows = " and more and more" if best.rate > 0.0 else ""
+            words = f"clouds are {max(best.lag, 0.0):.1f} s older than their stamps{grows}"
             wrong.append(Accusation(RejectionReason.CLOCK, share, words))
         for h in self.moved:
             shift, turn = float(np.linalg.norm(h.C[:2])), abs(float(h.C[2]))

@@ -119,13 +119,42 @@ def test_lag_that_grows_is_named_before_it_is_long():
     assert 0.1 * seconds * SPEED < 1.0  # metres that poses are off
 
 
+def straight(t):
+    """A robot that drives straight on: its planar pose at a time."""
+    return np.array([SPEED * t, 0.0, 0.0])
+
+
+def lagging(lag, way=pose):
+    """Clouds that are older than their stamps by ``lag(t)`` seconds."""
+    return lambda o, t: (o, moved(way(t - lag(t)), way(t + DT - lag(t + DT))))
+
+
+def test_clock_that_drifts_slowly_is_named():
+    _, accused, seconds = drive(lagging(lambda t: 0.02 * max(t - 10.0, 0.0)), until=40.0)
+    assert accused.cause is RejectionReason.CLOCK
+    assert 0.02 * seconds * SPEED < 0.8  # metres that poses are off
+
+
+@pytest.mark.parametrize(("rate", "seconds"), [(0.1, 10.0), (0.2, 5.0), (0.3, 6.0)])
+@pytest.mark.parametrize("after", ["it is set", "it stays late"])
+@pytest.mark.parametrize("way", [pose, straight])
+def test_clock_that_drifted_is_believed_again_only_once_it_is_set(rate, seconds, after, way):
+    def lag(t):
+        drifted = rate * min(max(t - 10.0, 0.0), seconds)
+        return 0.0 if after == "it is set" and t >= 10.0 + seconds else drifted
+
+    for until in 10.0 + seconds + np.arange(-DT, 4.0, DT):
+        faults, accused, _ = drive(lagging(lag, way), way, until=until, stops=False)
+        if after == "it stays late" or until < 10.0 + seconds:
+            assert accused.cause is RejectionReason.CLOCK
+        elif until >= 11.5 + seconds:
+            assert accused is None
+            assert faults.good > 0.9
+
+
 @pytest.mark.parametrize(("distance", "wrong"), [(0.13, "clouds"), (0.1, "odometry")])
 def test_on_a_straight_way_the_stamps_tell_a_clock_that_parts_from_odometry_out_of_scale(distance, wrong):
     """The clouds move by 0.7 of odometry's motion: they fall behind by 0.3 s per second, or odometry is too long."""
-
-    def straight(t):
-        return np.array([SPEED * t, 0.0, 0.0])
-
     faults, accused, _ = drive(lambda o, t: (o, o * [0.7, 1.0, 1.0]), straight, stamps=stamps(*[distance] * 5))
     if wrong == "clouds":
         assert accused.cause is RejectionReason.CLOCK
