@@ -372,10 +372,7 @@ def introduction(page: str) -> str:
 
 def _code() -> str:
     """Short hash of the product and the kernels, but for :data:`UNMEASURED`."""
-    package = ROOT / "coview_stream"
-    files = (str(file.relative_to(package)) for file in sorted(package.rglob("*")) if file.is_file())
-    measured = (f"coview_stream/{file}" for file in files if not file.startswith(UNMEASURED))
-    return fingerprint(*measured, "coview_kernels")
+    return fingerprint(without=UNMEASURED)
 
 
 def _made_by(name: str) -> str:

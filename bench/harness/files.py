@@ -83,18 +83,20 @@ def remembered(file: Path, spec: dict[str, Any], make: Callable[[], Any], wait: 
         return dict(json.loads(file.read_text())["result"])
 
 
-def fingerprint(*parts: str) -> str:
+def fingerprint(*parts: str, without: tuple[str, ...] = ()) -> str:
     """Return a short hash of the code and weights below ``parts``, e.g. ``coview_stream/sim``, by default of all.
 
-    Comments, docstrings and layout do not count, as prose does not invalidate a figure.
+    Comments, docstrings and layout do not count, as prose does not invalidate a figure, nor do files of a package whose
+    paths in it begin with one of ``without``.
     """
     total = hashlib.sha256()
     for part in parts or ("coview_stream", "coview_kernels"):
         root, _, below = part.partition("/")
         path = _ROOTS[root] / below
         for file in sorted(path.rglob("*")) if path.is_dir() else [path]:
-            if file.suffix in (".py", ".npz"):
-                total.update(str(file.relative_to(_ROOTS[root])).encode() + code_of(file.read_bytes(), file.suffix))
+            name = str(file.relative_to(_ROOTS[root]))
+            if file.suffix in (".py", ".npz") and not name.startswith(without):
+                total.update(name.encode() + code_of(file.read_bytes(), file.suffix))
     return total.hexdigest()[:10]
 
 

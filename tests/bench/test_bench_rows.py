@@ -12,6 +12,7 @@ from types import SimpleNamespace
 import pytest
 from sockets import until
 
+import coview_stream
 from bench import __main__ as bench
 from bench import results
 from bench.__main__ import BENCHMARKS, Benchmark, run
@@ -51,6 +52,9 @@ def test_a_result_is_reused_for_the_same_spec_only(tmp_path):
     assert [path.name for path in tmp_path.rglob("*")] == ["deep", "result.json"]  # no lock is left
     parts = ("coview_stream/sim", "coview_stream/descriptors/coview.py", "coview_kernels", "")
     assert len({fingerprint(part) if part else fingerprint() for part in parts}) == len(parts)
+    every = fingerprint(), fingerprint(without=results.UNMEASURED), fingerprint(without=("no such file",))
+    assert every[0] == every[2] != every[1]
+    assert all((Path(coview_stream.__file__).parent / name).exists() for name in results.UNMEASURED)
 
 
 def test_prose_does_not_change_the_hash_of_code():
@@ -128,9 +132,9 @@ def two_tables(monkeypatch, tmp_path):
     for name, module in {"a": "speed.search", "b": "speed.start"}.items():
         monkeypatch.setitem(results.BENCHMARKS, name, Benchmark(module, ""))
 
-    def fingerprint(*parts):
-        if "coview_kernels" in parts:
-            assert not any(name in part for part in parts for name in results.UNMEASURED)
+    def fingerprint(*parts, without=()):
+        if not parts:
+            assert without == results.UNMEASURED
             return said.code
         return said.bench["a" if "bench/speed/search.py" in parts else "b"]
 
