@@ -305,10 +305,10 @@ class FaultPosterior:
 
         # a drifting clock drifts on until it is set, or stays as late as it is
         parting = [h.after(step, stays) for h in self.parting]
-        for h in self.parting:
-            at = min(max(round(h.lag / float(LAGS[1])), 0), len(LAGS) - 2)
-            steady[0] += 0.5 * ends * h.weight * pairs[at, 0]
-            steady[at] += 0.5 * ends * h.weight * pairs[at, at]
+        for clock in self.parting:
+            at = min(max(round(clock.lag / float(LAGS[1])), 0), len(LAGS) - 2)
+            steady[0] += 0.5 * ends * clock.weight * pairs[at, 0]
+            steady[at] += 0.5 * ends * clock.weight * pairs[at, at]
         if step.clouds is not None and not stands and 0.0 < 1.0 - scale < _FASTEST:
             new = _Parting(come * (good + slip), 0.0, 0.0, np.diag([0.0, (0.5 * _FASTEST) ** 2]))
             parting.append(new.after(step, 1.0))
