@@ -16,6 +16,7 @@ from coview_kernels.reference.field import (
     NOT_SURVEYED,
     ON_GROUND,
     REACH,
+    RISE_STEPS,
     TURN,
     TURNS,
     UNDER_EDGE,
@@ -63,9 +64,25 @@ def ground_of(packed) -> ti.i32:
 
 
 @ti.func
-def bit(word, z):
-    """Return the bit of height ``z`` in half metres."""
-    return ti.cast((word >> (ti.cast(ti.floor(2.0 * z), ti.i64) & 63)) & 1, ti.i32)
+def level_of(z) -> ti.i32:
+    """Return the number of a height in half metres."""
+    return ti.cast(ti.floor(2.0 * z), ti.i32)
+
+
+@ti.func
+def both_bits(bits: ti.template(), at, level) -> ti.i64:
+    """Return the word of a cell, whose first word is at ``at``, shifted so that bits 0 and 32 are those of a level."""
+    return bits[at + ((level >> 5) & 1)] >> ti.cast(level & 31, ti.i64)
+
+
+@ti.func
+def near_bit(word) -> ti.i32:
+    return ti.cast(word & 1, ti.i32)
+
+
+@ti.func
+def on_bit(word) -> ti.i32:
+    return ti.cast((word >> 32) & 1, ti.i32)
 
 
 @ti.func
@@ -109,7 +126,7 @@ def _nine_cells(down, across, structure: ti.template(), p, x, y, z, yaw, step):
     """Return a point's level, and its three rows and columns at a pose and at shifts of ``step`` metres."""
     c, s = ti.cos(yaw), ti.sin(yaw)
     u, v = structure[0, p], structure[1, p]
-    level = ti.cast(ti.floor(2.0 * (z + structure[2, p])), ti.i64) & 63
+    level = level_of(z + structure[2, p])
     rows = ti.Vector.zero(ti.i32, 3)
     columns = ti.Vector.zero(ti.i32, 3)
     for k in ti.static(range(3)):
@@ -128,8 +145,8 @@ def fine_hits(
         level, rows, columns = _nine_cells(down, across, structure, p, x, y, z, yaw, step)
         for i in ti.static(range(3)):
             for j in ti.static(range(3)):
-                at = 2 * place(table, across, rows[i], columns[j]) + first
-                hits[3 * i + j] += ti.cast(((bits[at] >> level) & 1) + ((bits[at + 1] >> level) & 1), ti.i32)
+                word = both_bits(bits, 2 * place(table, across, rows[i], columns[j]) + first, level)
+                hits[3 * i + j] += near_bit(word) + on_bit(word)
 
 
 @ti.func
@@ -144,7 +161,8 @@ def closer_hits(
         cells = ti.Vector.zero(ti.i32, 4)
         for k in ti.static(range(4)):
             at = 2 * place(table, across, rows[2 * (k // 2)], columns[2 * (k % 2)]) + first
-            cells[k] = ti.cast(((bits[at] >> level) & 1) + ((bits[at + 1] >> level) & 1), ti.i32)
+            word = both_bits(bits, at, level)
+            cells[k] = near_bit(word) + on_bit(word)
         low = rows[1] == rows[0]
         left = columns[1] == columns[0]
         upper, lower = ti.select(left, cells[0], cells[1]), ti.select(left, cells[2], cells[3])
@@ -169,8 +187,8 @@ def hits_at(
     for p in range(structure.shape[1]):
         u, v = structure[0, p], structure[1, p]
         at = 2 * cell_at(table, down, across, x + c * u - s * v, y + s * u + c * v) + first
-        level = z + structure[2, p]
-        hits += bit(bits[at], level) + bit(bits[at + 1], level)
+        word = both_bits(bits, at, level_of(z + structure[2, p]))
+        hits += near_bit(word) + on_bit(word)
     return hits
 
 
@@ -181,15 +199,15 @@ def rise(
 ) -> ti.f32:  # fmt: skip
     """Return the metres that the scan has to rise to the map's ground, from points within ``reach`` of it."""
     c, s = ti.cos(yaw), ti.sin(yaw)
-    total, number = ti.cast(0.0, ti.f32), 0
+    total, number = 0, 0  # in whole steps: LLVM adds floats one after another
     for p in range(low.shape[1]):
         u, v = low[0, p], low[1, p]
         at = cell_at(table, down, across, x + c * u - s * v, y + s * u + c * v)
         d = base[at >> 10] + CENTIMETRE * ground_of(surface[at]) - z - low[2, p]
         counts = ti.cast(ground_of(surface[at]) > NOT_SURVEYED, ti.i32) & ti.cast(ti.abs(d) < reach, ti.i32)
-        total += ti.select(counts > 0, d, 0.0)
+        total += ti.cast(ti.floor(RISE_STEPS * ti.select(counts > 0, d, 0.0) + 0.5), ti.i32)
         number += counts
-    return total / ti.max(number, 1)
+    return ti.cast(total, ti.f32) / ti.cast(RISE_STEPS * ti.max(number, 1), ti.f32)
 
 
 @runtime.kernel
@@ -256,11 +274,12 @@ def score(
                         known = ti.cast(ground_of(word) != NOT_SURVEYED, ti.i32)
                         level = z + structure[2, p]
                         edge = word >> 16
-                        hit = bit(bits[2 * at + first], level)
+                        both = both_bits(bits, 2 * at + first, level_of(level))
+                        hit = near_bit(both)
                         top = ti.select(edge > 0, base[at >> 10] + EDGE_STEP * edge, -1e6)
                         inside += known
                         close += hit & known
-                        on += bit(bits[2 * at + 1 + first], level) & known
+                        on += on_bit(both) & known
                         covered += (hit | ti.cast(top > level - UNDER_EDGE, ti.i32)) & known
                     for p in range(low.shape[1]):
                         u, v = low[0, p], low[1, p]
@@ -270,13 +289,14 @@ def score(
                         level = z + low[2, p]
                         off = level - base[at >> 10] - CENTIMETRE * height
                         flat = ti.cast(ti.abs(off) < ON_GROUND, ti.i32)
-                        upper = ti.cast(off > UPPER_FLOOR, ti.i32) & bit(bits[2 * at + 1 + first], level)
+                        both = both_bits(bits, 2 * at + first, level_of(level))
+                        upper = ti.cast(off > UPPER_FLOOR, ti.i32) & on_bit(both)
                         inside_low += known
                         grounded += (flat | upper) & known
                     for p in range(free.shape[1]):
                         u, v = free[0, p], free[1, p]
                         at = cell_at(table, down, across, x + c * u - s * v, y + s * u + c * v)
-                        passed += bit(bits[2 * at + 1 + first], z + free[2, p])
+                        passed += on_bit(both_bits(bits, 2 * at + first, level_of(z + free[2, p])))
                     poses[4 * h] = x
                     poses[4 * h + 1] = y
                     poses[4 * h + 2] = z

@@ -19,6 +19,7 @@ I8 = npt.NDArray[np.int8]
 I16 = npt.NDArray[np.int16]
 I32 = npt.NDArray[np.int32]
 I64 = npt.NDArray[np.int64]
+U64 = npt.NDArray[np.uint64]
 C64 = npt.NDArray[np.complex64]
 Mask = npt.NDArray[np.bool_]
 

@@ -24,7 +24,7 @@ import numpy as np
 import numpy.typing as npt
 
 from coview_kernels import reference, runtime
-from coview_kernels.arrays import F32, F64, I16, I32, I64, U8, U16, Mask, as_finite64, as_float32
+from coview_kernels.arrays import F32, F64, I16, I32, I64, U8, U16, U64, Mask, as_finite64, as_float32
 from coview_kernels.launch import Launch
 from coview_kernels.mapped import Windows
 from coview_kernels.reference.field import CELL, NOT_SURVEYED, TILE, FieldLayers, Plan
@@ -35,6 +35,7 @@ COARSE, FINE, LOW, LEVELS = 96, 160, 64, 2
 of 24 places was lost in one world; docs/results.md says how often the right place comes first."""
 
 _MAX_TABLE = 1 << 21  # tiles in a map's bounding rectangle, 537 km2: kernels count in int32
+_HALF, _LOWER = np.uint64(32), np.uint64(0xFFFFFFFF)  # bits of half a word, and its lower half
 _MIDDLE = 1 << 31  # words of bits that a signed 32-bit index reaches; on larger maps it counts from this word
 _BATCH = 512  # tiles at a time, to keep intermediate arrays small
 _BAND = 16  # rows of tiles at a time, for the same reason
@@ -86,6 +87,17 @@ class FieldScan:
     """(G, 3) points on the ground."""
     free: F32
     """(F, 3) points in free space, which rays have passed."""
+
+    @cached_property
+    def parts(self) -> tuple[F32, F32, F32, F32, F32, F32]:
+        """The points, and those of the levels, as in :class:`Plan`; ValueError if a shape is wrong."""
+        structure, low, free = (as_float32(name, getattr(self, name), None, 3) for name in ("structure", "low", "free"))
+        return structure, low, free, _spread(structure, COARSE), _spread(structure, FINE), _spread(low, LOW)
+
+    @cached_property
+    def columns(self) -> tuple[F32, ...]:
+        """:attr:`parts` as the kernel reads them, (3, N) each."""
+        return tuple(np.ascontiguousarray(points.T) for points in self.parts)
 
 
 @dataclass(frozen=True, eq=False)
@@ -156,6 +168,11 @@ class FieldMap:
         """Rasters for the look-ups, 22 bytes per cell, built at first use unless they are stored."""
         return self.made_layers() if self.stored is None else self.stored
 
+    @cached_property
+    def kernel(self) -> FieldKernel:
+        """Kernel with the :attr:`layers`."""
+        return FieldKernel(self.layers)
+
     def made_layers(
         self, zeros: Zeros = lambda _, shape, kind: np.zeros(shape, kind), done: Callable[[], object] = lambda: None
     ) -> FieldLayers:
@@ -170,7 +187,8 @@ class FieldMap:
         surface[:1] = NOT_SURVEYED & 0xFFFF
         for start in range(0, tiles - 1, _BATCH):
             part, into = slice(start, start + _BATCH), slice(start + 1, start + 1 + _BATCH)
-            bits[into, ..., 1] = self.occupied[part]
+            on = self.occupied[part].view(np.uint64)
+            bits[into] = _packed(np.zeros_like(on), on)
             surface[into] = (self.edge[part].astype(np.int32) << 16) | (self.ground[part].astype(np.int32) & 0xFFFF)
             done()
         _fill_near(bits, table, done)
@@ -200,16 +218,18 @@ def field_scores(field: FieldMap, scan: FieldScan, poses: npt.ArrayLike, move: M
         ValueError: a shape is wrong, or a pose not finite.
     """
     start = as_finite64("poses", poses, None, 4)
-    structure, low, free = (as_float32(name, getattr(scan, name), None, 3) for name in ("structure", "low", "free"))
-    few = _spread(structure, COARSE), _spread(structure, FINE), _spread(low, LOW)
-    levels = {Move.NONE: -1, Move.HEIGHT: 0}.get(move, LEVELS)
-    plan = Plan(structure, low, free, *few, levels, move is Move.FAR)
-    layers = field.layers
+    plan = Plan(*scan.parts, {Move.NONE: -1, Move.HEIGHT: 0}.get(move, LEVELS), move is Move.FAR)
+    layers, native = field.layers, field.kernel
     corner = np.array([*field.corner[::-1] * (TILE * CELL), 0.0, 0.0])
     # float32 resolves a tenth of a millimetre at a kilometre from the corner
     pose, counts = start - corner, np.zeros((len(start), 7), dtype=np.int32)
     for rows in _groups(layers, pose):
-        pose[rows], counts[rows] = runtime.dispatch(_native, reference.field_scores, layers, plan, pose[rows])
+        pose[rows], counts[rows] = runtime.dispatch_here(
+            native.ready,
+            lambda at: native(scan, plan.levels, plan.coarse, at),
+            lambda at: reference.field_scores(layers, plan, at),
+            pose[rows],
+        )
     return FieldScores(pose + corner, *np.ascontiguousarray(counts.T))
 
 
@@ -267,20 +287,38 @@ def _from_corner(field: FieldMap, structure: F32, pose: npt.ArrayLike) -> tuple[
     return as_float32("structure", structure, None, 3), at - corner
 
 
-def _native(layers: FieldLayers, plan: Plan, start: F64) -> tuple[F64, I32]:
-    poses, counts = np.ascontiguousarray(start), np.zeros((len(start), 7), dtype=np.int32)
-    bits, first = layers.bits.reshape(-1), 0
-    if len(bits) > _MIDDLE:
-        bits, first = bits[_MIDDLE:], -_MIDDLE
-    Launch(
-        "field", "score",
-        layers.coarse.reshape(-1), layers.coarse.shape[1], layers.coarse.shape[2],
-        layers.table.reshape(-1), layers.table.shape[1], layers.base, bits, first,
-        layers.surface.reshape(-1), *(np.ascontiguousarray(points.T) for points in plan[:6]), plan.levels,
-        int(plan.coarse),
-        poses.reshape(-1), counts.reshape(-1), runtime.workers(),
-    )()  # fmt: skip
-    return poses, counts
+class FieldKernel:
+    """The kernel with the layers of a map; its launch keeps them and the points of the last scan."""
+
+    def __init__(self, layers: FieldLayers) -> None:
+        bits, first = layers.bits.reshape(-1), 0
+        if len(bits) > _MIDDLE:
+            bits, first = bits[_MIDDLE:], -_MIDDLE
+        self._of_map = (
+            layers.coarse.reshape(-1), layers.coarse.shape[1], layers.coarse.shape[2], layers.table.reshape(-1),
+            layers.table.shape[1], layers.base, bits, first, layers.surface.reshape(-1),
+        )  # fmt: skip
+        self._launch: Launch | None = None
+        self._columns: tuple[F32, ...] = ()
+
+    def ready(self) -> bool:
+        """Return whether any thread may call it, as :meth:`Launch.ready`."""
+        return self._launch is not None and self._launch.ready()
+
+    def __call__(self, scan: FieldScan, levels: int, coarse: bool, start: F64) -> tuple[F64, I32]:
+        """Compute :func:`reference.field_scores`."""
+        poses, counts = np.ascontiguousarray(start), np.zeros((len(start), 7), dtype=np.int32)
+        rest = levels, int(coarse), poses.reshape(-1), counts.reshape(-1), runtime.workers()
+        if self._launch is None:
+            self._launch = Launch("field", "score", *self._of_map, *scan.columns, *rest)
+        else:
+            new = rest if self._columns is scan.columns else (*scan.columns, *rest)
+            count = len(self._of_map) + len(scan.columns) + len(rest)
+            for index, value in enumerate(new, count - len(new)):
+                self._launch.put(index, value)
+        self._columns = scan.columns
+        self._launch()
+        return poses, counts
 
 
 def _spread(points: F32, count: int) -> F32:
@@ -289,23 +327,33 @@ def _spread(points: F32, count: int) -> F32:
 
 
 def _fill_near(bits: I64, table: I32, done: Callable[[], object]) -> None:
-    """Set the first bits of (T + 1, 32, 32, 2) at the second bits and at their six neighbours half a metre away."""
+    """Set the bits near structure, at the bits on it and at their six neighbours half a metre away."""
     row, column = np.nonzero(table)
     for start in range(0, len(row), _BATCH):
         rows, columns = row[start : start + _BATCH], column[start : start + _BATCH]
-        here = bits[table[rows, columns], ..., 1]
-        padded = np.zeros((len(here), TILE + 2, TILE + 2), dtype=np.int64)
-        padded[:, 1:-1, 1:-1] = here
-        padded[:, 0, 1:-1] = bits[table[rows - 1, columns], -1, :, 1]
-        padded[:, -1, 1:-1] = bits[table[rows + 1, columns], 0, :, 1]
-        padded[:, 1:-1, 0] = bits[table[rows, columns - 1], :, -1, 1]
-        padded[:, 1:-1, -1] = bits[table[rows, columns + 1], :, 0, 1]
-        words = here.view(np.uint64)
+        on = _on(bits[table[rows, columns]])
+        padded = np.zeros((len(on), TILE + 2, TILE + 2), dtype=np.uint64)
+        padded[:, 1:-1, 1:-1] = on
+        padded[:, 0, 1:-1] = _on(bits[table[rows - 1, columns], -1])
+        padded[:, -1, 1:-1] = _on(bits[table[rows + 1, columns], 0])
+        padded[:, 1:-1, 0] = _on(bits[table[rows, columns - 1], :, -1])
+        padded[:, 1:-1, -1] = _on(bits[table[rows, columns + 1], :, 0])
         one, rest = np.uint64(1), np.uint64(63)
-        near = (words | (words << one) | (words >> rest) | (words >> one) | (words << rest)).view(np.int64)
+        near = on | (on << one) | (on >> rest) | (on >> one) | (on << rest)
         near |= padded[:, :-2, 1:-1] | padded[:, 2:, 1:-1] | padded[:, 1:-1, :-2] | padded[:, 1:-1, 2:]
-        bits[table[rows, columns], ..., 0] = near
+        bits[table[rows, columns]] = _packed(near, on)
         done()
+
+
+def _packed(near: U64, on: U64) -> I64:
+    """Return the words (..., 2) of :attr:`FieldLayers.bits` from the bits (...) of all 64 heights."""
+    return np.stack([(near & _LOWER) | (on << _HALF), (near >> _HALF) | (on & ~_LOWER)], axis=-1).view(np.int64)
+
+
+def _on(words: I64) -> U64:
+    """Return the bits (...) on structure of all 64 heights from words (..., 2)."""
+    both = np.ascontiguousarray(words).view(np.uint64)
+    return (both[..., 0] >> _HALF) | (both[..., 1] & ~_LOWER)
 
 
 def _fill_coarse(planes: U16, bits: I64, table: I32, done: Callable[[], object]) -> None:
@@ -336,7 +384,7 @@ def _folded(bits: I64, table: I32, done: Callable[[], object]) -> npt.NDArray[np
     used = np.flatnonzero(tiles)
     for start in range(0, len(used), _BATCH):
         part = used[start : start + _BATCH]
-        cells = bits[tiles[part], ..., 1].view(np.uint64).reshape(-1, half, 2, half, 2)
+        cells = _on(bits[tiles[part]]).reshape(-1, half, 2, half, 2)
         folded[part] = _pairs(cells[:, :, 0, :, 0] | cells[:, :, 0, :, 1] | cells[:, :, 1, :, 0] | cells[:, :, 1, :, 1])
         done()
     return folded.reshape(*table.shape, half, half)

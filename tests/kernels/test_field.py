@@ -8,9 +8,8 @@ import numpy as np
 import pytest
 
 import coview_kernels as kernels
-from coview_kernels import field as field_module
 from coview_kernels import reference
-from coview_kernels.field import COARSE, FINE, LOW, FieldMap, FieldScan, _spread
+from coview_kernels.field import FieldKernel, FieldMap, FieldScan
 from coview_kernels.mapped import Windows
 from coview_kernels.reference.field import NO_GROUND, TILE, FieldLayers, Plan
 
@@ -47,11 +46,6 @@ def scan_at(points: np.ndarray, pose: np.ndarray, rng: np.random.Generator) -> F
     free = np.column_stack([rng.uniform(2, 46, (300, 2)), rng.uniform(1, 6, 300)])
     seen = [((p - pose[:3]) @ turn).astype(np.float32) for p in (high, flat, free)]
     return FieldScan(*seen)
-
-
-def plan_of(scan: FieldScan, levels: int, coarse: bool) -> Plan:
-    few = _spread(scan.structure, COARSE), _spread(scan.structure, FINE), _spread(scan.low, LOW)
-    return Plan(scan.structure, scan.low, scan.free, *few, levels, coarse)
 
 
 @pytest.fixture(scope="module")
@@ -97,12 +91,46 @@ def test_kernel_agrees_with_its_numpy_twin(scene: Scene):
         (Move.FAR, 2, True),
         (Move.NEAR, 2, False),
     ):
-        poses, counts = reference.field_scores(field.layers, plan_of(scan, levels, coarse), starts - corner)
+        poses, counts = reference.field_scores(field.layers, Plan(*scan.parts, levels, coarse), starts - corner)
         found = kernels.field_scores(field, scan, starts, move)
         # a point on a cell's edge may round to either side; a few of a thousand do
         same = (np.abs(found.pose - poses - corner) < 0.02).all(axis=1)
         assert same.mean() > 0.9
         assert np.abs(np.column_stack(found[1:])[same] - counts[same]).max() <= 6
+
+
+def test_structure_counts_at_all_64_levels_and_at_the_six_neighbours():
+    rng = np.random.default_rng(5)
+    cells = rng.random((TILE, TILE, 64)) < 0.05
+    words = np.bitwise_or.reduce(cells.astype(np.uint64) << np.arange(64, dtype=np.uint64), axis=2)
+    flat = np.zeros((1, TILE, TILE))
+    field = FieldMap(
+        np.zeros((1, 3), np.int32), words.view(np.int64)[None], flat.astype(np.int16), flat.astype(np.uint8)
+    )
+    at = np.array(list(np.ndindex(TILE, TILE, 64)))
+    points = (0.5 * at[:, [1, 0, 2]] + 0.25).astype(np.float32)
+    near = np.pad(cells, ((1, 1), (1, 1), (0, 0)))
+    near = near[1:-1, :-2] | near[1:-1, 2:] | near[:-2, 1:-1] | near[2:, 1:-1]
+    near |= cells | np.roll(cells, 1, axis=2) | np.roll(cells, -1, axis=2)
+    for rows, shift in ((at[:, 2] < 32, 0.0), (at[:, 2] >= 32, 0.0), (at[:, 2] >= 0, 32.0)):  # heights repeat by 32 m
+        scan = FieldScan(points[rows], points[:0], points[rows])
+        found = kernels.field_scores(field, scan, [[0.0, 0.0, shift, 0.0]], kernels.Move.NONE)
+        on, close = (int(mask[tuple(at[rows].T)].sum()) for mask in (cells, near))
+        assert (found.on[0], found.near[0], found.passed[0]) == (on, close, on)
+
+
+def test_one_map_scores_one_scan_after_another(scene: Scene):
+    field, scan, _, others = scene
+    other = FieldScan(scan.structure[::2], scan.low[::3], scan.free[::2])
+    first = kernels.field_scores(field, scan, others)
+    second = kernels.field_scores(field, other, others[:7])
+    assert len(second.pose) == 7
+    assert second.structure.max() <= len(other.structure) < first.structure.max()
+    alone = replace(field)
+    for one, again in zip(kernels.field_scores(alone, other, others[:7]), second, strict=True):
+        np.testing.assert_array_equal(one, again)
+    for one, again in zip(kernels.field_scores(field, scan, others), first, strict=True):
+        np.testing.assert_array_equal(one, again)
 
 
 def test_unsurveyed_cells_are_left_out(scene: Scene):
@@ -209,7 +237,13 @@ def test_tiles_beyond_what_32_bits_count_are_looked_up(scene: Scene, tmp_path: P
     assert large.bits.size > 2**31
     corner = np.array([*field.corner[::-1] * 16.0, 0.0, 0.0])
     starts = np.vstack([others, pose]) - corner
-    found = field_module._native if kernels.backend() != "numpy" else reference.field_scores
-    both = (kernels.submit(found, each, plan_of(scan, 2, True), starts.copy()) for each in (layers, large))
+    plan = Plan(*scan.parts, 2, True)
+
+    def scores(each: FieldLayers) -> tuple[np.ndarray, np.ndarray]:
+        if kernels.backend() == "numpy":
+            return reference.field_scores(each, plan, starts.copy())
+        return FieldKernel(each)(scan, 2, True, starts.copy())
+
+    both = (kernels.submit(scores, each) for each in (layers, large))
     for one, other in zip(*both, strict=True):
         np.testing.assert_array_equal(one, other)

@@ -18,6 +18,9 @@ REACH, TURNS, TURN = 3, 7, 0.0349066
 NEAR_STEP, NEAR_TURN = 0.25, 0.00872665
 """Metres and radians of the first fine level without a coarse level; each further level halves them."""
 
+RISE_STEPS = 1024
+"""Steps in a metre by which a scan's height is raised: sums of whole numbers vectorize."""
+
 ON_GROUND, UNDER_EDGE, UPPER_FLOOR, EDGE_STEP = 0.15, 0.5, 1.5, 0.25
 """Metres: tolerance of points on the ground; tolerance of points below a roof edge; height above the lowest surface
 from which only the bits decide on a floor; unit of the stored edges."""
@@ -31,7 +34,8 @@ class FieldLayers(NamedTuple):
     base: F32
     """(T + 1,) base of a tile's heights, metres."""
     bits: I64
-    """(T + 1, 32, 32, 2) bit ``floor(2 z) mod 64``: near structure; on structure."""
+    """(T + 1, 32, 32, 2) structure at height z, by ``32 h + k = floor(2 z) mod 64``: bit k of word h, near structure;
+    bit k + 32, on structure."""
     surface: I32
     """(T + 1, 32, 32) ground in the lower half, centimetres; edge above it."""
     coarse: U16
@@ -131,9 +135,11 @@ def _cells(layers: FieldLayers, points: F32) -> tuple[I64, I64, I64]:
     return tile, row % TILE, column % TILE
 
 
-def _bit(words: I64, z: F32) -> Mask:
+def _near_and_on(layers: FieldLayers, cell: tuple[I64, I64, I64], z: F32) -> tuple[Mask, Mask]:
+    """Return whether heights z (N,) in cells are near structure, and on structure."""
     level = np.floor(z / np.float32(CELL)).astype(np.int64) & 63
-    return np.asarray((words >> level) & 1, dtype=bool)
+    words = layers.bits[(*cell, level >> 5)] >> (level & 31)
+    return (words & 1).astype(bool), (words >> 32 & 1).astype(bool)
 
 
 def _heights(layers: FieldLayers, cell: tuple[I64, I64, I64]) -> tuple[F32, Mask, Mask]:
@@ -155,13 +161,14 @@ def _rise(layers: FieldLayers, low: F32, pose: F64, reach: float) -> float:
     height, has, _ = _heights(layers, _cells(layers, placed))
     off = height - placed[:, 2]
     some = has & (np.abs(off) < reach)
-    return float(off[some].mean()) if some.any() else 0.0
+    steps = np.floor(np.float32(RISE_STEPS) * off[some] + np.float32(0.5)).astype(np.int32).sum()
+    return float(np.float32(steps) / np.float32(RISE_STEPS * max(int(some.sum()), 1)))
 
 
 def _fine_hits(layers: FieldLayers, structure: F32, pose: F64) -> int:
     placed = _placed(structure, pose)
-    words = layers.bits[_cells(layers, placed)]
-    return int(_bit(words[:, 0], placed[:, 2]).sum()) + int(_bit(words[:, 1], placed[:, 2]).sum())
+    near, on = _near_and_on(layers, _cells(layers, placed), placed[:, 2])
+    return int(near.sum()) + int(on.sum())
 
 
 def structure_at(layers: FieldLayers, structure: F32, pose: F64) -> tuple[Mask, Mask, Mask, Mask]:
@@ -170,10 +177,11 @@ def structure_at(layers: FieldLayers, structure: F32, pose: F64) -> tuple[Mask, 
     cell = _cells(layers, placed)
     _, _, surveyed = _heights(layers, cell)
     edge = layers.surface[cell] >> 16
-    near = _bit(layers.bits[cell][:, 0], placed[:, 2]) & surveyed
+    near, on = _near_and_on(layers, cell, placed[:, 2])
+    near &= surveyed
     top = np.where(edge > 0, layers.base[cell[0]] + np.float32(EDGE_STEP) * edge.astype(np.float32), np.float32(-1e6))
     covered = (near | (top > placed[:, 2] - np.float32(UNDER_EDGE))) & surveyed
-    return surveyed, near, covered, _bit(layers.bits[cell][:, 1], placed[:, 2]) & surveyed
+    return surveyed, near, covered, on & surveyed
 
 
 def near_shifted(layers: FieldLayers, structure: F32, pose: F64, offsets: I64) -> Mask:
@@ -189,10 +197,11 @@ def near_shifted(layers: FieldLayers, structure: F32, pose: F64, offsets: I64) -
     tile = layers.table[row // TILE][:, column // TILE].astype(np.int64)
     at = ((tile * TILE) + (row % TILE)[:, None]) * TILE + column % TILE
     known = layers.surface.reshape(-1).take(at).astype(np.int16) != NOT_SURVEYED
-    words = np.where(known, layers.bits.reshape(-1).take(2 * at), 0).ravel()
-    width = np.array([len(column), 1])
+    words = np.where(known[..., None], layers.bits.reshape(-1, 2).take(at, axis=0), 0).ravel()
+    width = 2 * np.array([len(column), 1])
     level = np.floor(placed[:, 2] / np.float32(CELL)).astype(np.int64) & 63
-    return np.asarray((words.take((offsets @ width)[:, None] + (cell - first) @ width) >> level) & 1, dtype=bool)
+    index = (offsets @ width)[:, None] + (cell - first) @ width + (level >> 5)
+    return np.asarray((words.take(index) >> (level & 31)) & 1, dtype=bool)
 
 
 def _counts(layers: FieldLayers, plan: Plan, pose: F64) -> tuple[int, ...]:
@@ -201,9 +210,9 @@ def _counts(layers: FieldLayers, plan: Plan, pose: F64) -> tuple[int, ...]:
     under = _cells(layers, lower)
     height, has, known = _heights(layers, under)
     off = lower[:, 2] - height
-    upper = (off > UPPER_FLOOR) & _bit(layers.bits[under][:, 1], lower[:, 2])
+    upper = (off > UPPER_FLOOR) & _near_and_on(layers, under, lower[:, 2])[1]
     grounded = ((has & (np.abs(off) < ON_GROUND)) | upper) & known
     free = _placed(plan.free, pose)
-    passed = _bit(layers.bits[_cells(layers, free)][:, 1], free[:, 2])
+    _, passed = _near_and_on(layers, _cells(layers, free), free[:, 2])
     masks = surveyed, near, covered, known, grounded, passed, on
     return tuple(int(mask.sum()) for mask in masks)
