@@ -93,16 +93,14 @@ class Background:
 
 def outcomes(observed: Floats32) -> Floats:
     """Return shares (P, 4) of the structure's outcomes in observations (P, 7 or 15): on, near, edge, unexplained."""
-    on, near, edge, covered = (observed[:, k].astype(np.float64) for k in range(4))
-    return np.column_stack([on, near - on, edge, np.maximum(covered - near - edge, 0.0)])
+    on, near, edge, covered = observed[:, :4].T.astype(np.float64)
+    return np.stack([on, near - on, edge, np.maximum(covered - near - edge, 0.0)], axis=1)
 
 
 def observe_around(layers: kernels.FieldMap, part: ScanPart, poses: Floats) -> Floats32:
     """Return (P, 8): means of the four outcomes' shares at the neighbours of poses (P, 4), then their variances."""
-    nothing = part.points.structure[:0]
-    structure = replace(part, points=replace(part.points, low=nothing, free=nothing))
     neighbours = (poses[:, None] + _NEIGHBOURS).reshape(-1, 4)
-    shares = structure.look_up(layers, neighbours, kernels.Move.NONE).shares
+    shares = part.structure.look_up(layers, neighbours, kernels.Move.NONE).shares
     each = outcomes(shares).reshape(-1, len(_NEIGHBOURS), 4)
     return np.column_stack([each.mean(axis=1), each.var(axis=1, ddof=1)]).astype(np.float32)
 

@@ -17,7 +17,7 @@ from dataclasses import dataclass
 import numpy as np
 
 import coview_kernels as kernels
-from coview_stream.geometry.arrays import Floats
+from coview_stream.geometry.arrays import Floats, Ints
 from coview_stream.geometry.transforms import Points, rot_z, yaw_of
 from coview_stream.localization.evidence.observation import ObservedScan
 
@@ -112,8 +112,7 @@ def _shift_ratios(field: kernels.FieldMap, seen: SeenStructure, shifts: Floats) 
 
 def _in_patches(points: Points) -> Floats:
     """Return weights (P, N) of points (N, 3) that average over each of P patches."""
-    cell = np.floor(points[:, :2] / np.float32(_PATCH)).astype(np.int64)
-    patch = np.unique(cell, axis=0, return_inverse=True)[1].ravel()
+    patch = np.unique(_cells(points[:, :2], _PATCH), return_inverse=True)[1]
     weights = (patch == np.arange(int(patch.max()) + 1)[:, None]).astype(np.float64)
     return np.asarray(weights / weights.sum(axis=1, keepdims=True))
 
@@ -157,11 +156,17 @@ class SeenStructure:
 
 def _sample(points: Points) -> Points:
     """Return one point per voxel, some hundreds at most."""
-    _, first = np.unique(np.floor(points / np.float32(_VOXEL)).astype(np.int64), axis=0, return_index=True)
+    _, first = np.unique(_cells(points, _VOXEL), return_index=True)
     points = points[np.sort(first)]
     if len(points) > _MAX_POINTS:
         points = points[np.linspace(0, len(points) - 1, _MAX_POINTS).astype(np.int64)]
     return points
+
+
+def _cells(points: Points, size: float) -> Ints:
+    """Return the numbers (N,) of the cells of an edge ``size`` that hold points (N, D), in the order of x, y, ..."""
+    cell = np.floor(points / np.float32(size)).astype(np.int64) + (1 << 20)
+    return np.asarray(cell @ (1 << np.arange(21 * (points.shape[1] - 1), -1, -21)))
 
 
 def _explained(field: kernels.FieldMap, seen: SeenStructure, shifts: Floats) -> Floats:

@@ -13,9 +13,9 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from enum import IntEnum
-from functools import lru_cache
+from functools import cached_property, lru_cache
 
 import numpy as np
 
@@ -100,9 +100,46 @@ class Evidence:
 class Observations:
     """Observations of the map from H poses."""
 
-    poses: Floats  # (H, 4) x, y, z of the body in the map, metres, and heading of the odometry frame, radians
-    shares: Floats32  # (H, 7), columns as in Share
-    parts: Floats  # (H, 5), columns as the fields of Evidence
+    scan: ScanPart  # the points that were looked up
+    counts: kernels.FieldScores  # of these points
+
+    @property
+    def poses(self) -> Floats:
+        """(H, 4) x, y, z of the body in the map, metres, and heading of the odometry frame, radians."""
+        return self.counts.pose
+
+    @cached_property
+    def shares(self) -> Floats32:
+        """(H, 7) shares, columns as in :class:`Share`."""
+        counts, points, level = self.counts, self.scan.points, self.scan.level
+        structure, low, free = (max(len(p), 1) for p in (points.structure, points.low, points.free))
+        shares = np.empty((len(counts.pose), len(Share)), dtype=np.float32)
+        shares[:, Share.ON] = counts.on / structure
+        shares[:, Share.NEAR] = counts.near / structure
+        shares[:, Share.EDGE] = (counts.covered - counts.near) / structure
+        shares[:, Share.COVERED] = counts.structure / structure
+        shares[:, Share.GROUND] = level * counts.grounded / low
+        shares[:, Share.COVERED_GROUND] = level * counts.low / low
+        shares[:, Share.PASSED] = counts.passed / free
+        return shares
+
+    @cached_property
+    def parts(self) -> Floats:
+        """(H, 5) evidence, columns as the fields of :class:`Evidence`."""
+        counts, points = self.counts, self.scan.points
+        high, flat, free = self.scan.weights
+        structure, low, near = counts.structure * high, counts.low * flat, counts.near * high
+        surveyed = np.maximum(counts.structure, 1)
+        few = structure < _MIN_STRUCTURE
+        passed = counts.passed * free * _POINTS_PASSED
+        total = len(points.structure) * high + len(points.low) * flat
+        return np.column_stack([
+            np.where(few, 0.0, counts.near / surveyed),
+            np.where(few, 0.0, counts.covered / surveyed),
+            (counts.grounded * flat + 0.5 * _PSEUDO) / (low + _PSEUDO),
+            (near + 0.5 * _PSEUDO) / (near + passed + _PSEUDO),
+            (structure + low) / max(total, 1.0),
+        ])  # fmt: skip
 
     @property
     def scores(self) -> Floats32:
@@ -134,34 +171,18 @@ class ScanPart:
         structure, low, free = (len(p) / max(len(s), 1) for p, s in zip(kinds, samples, strict=True))
         return cls(kernels.FieldScan(*samples), (structure, low, free), level)
 
+    @cached_property
+    def structure(self) -> ScanPart:
+        """The structure alone."""
+        nothing = self.points.structure[:0]
+        return replace(self, points=replace(self.points, low=nothing, free=nothing))
+
     def look_up(self, field: kernels.FieldMap, poses: Floats, move: Move) -> Observations:
         """Observe the map from poses (H, 4), as in :class:`Observations`, each first moved as far as ``move`` allows.
 
         ``Move.NEAR`` allows odometry's drift between keyframes.
         """
-        scores = kernels.field_scores(field, self.points, poses, move)
-        structure, low, free = (max(len(p), 1) for p in (self.points.structure, self.points.low, self.points.free))
-        shares = np.column_stack([
-            scores.on / structure, scores.near / structure, (scores.covered - scores.near) / structure,
-            scores.structure / structure, self.level * scores.grounded / low, self.level * scores.low / low,
-            scores.passed / free,
-        ])  # fmt: skip
-        return Observations(scores.pose, shares.astype(np.float32), self._parts(scores))
-
-    def _parts(self, scores: kernels.FieldScores) -> Floats:
-        high, flat, free = self.weights
-        structure, low, near = scores.structure * high, scores.low * flat, scores.near * high
-        surveyed = np.maximum(scores.structure, 1)
-        few = structure < _MIN_STRUCTURE
-        passed = scores.passed * free * _POINTS_PASSED
-        total = len(self.points.structure) * high + len(self.points.low) * flat
-        return np.column_stack([
-            np.where(few, 0.0, scores.near / surveyed),
-            np.where(few, 0.0, scores.covered / surveyed),
-            (scores.grounded * flat + 0.5 * _PSEUDO) / (low + _PSEUDO),
-            (near + 0.5 * _PSEUDO) / (near + passed + _PSEUDO),
-            (structure + low) / max(total, 1.0),
-        ])  # fmt: skip
+        return Observations(self, kernels.field_scores(field, self.points, poses, move))
 
 
 @dataclass(frozen=True, eq=False)

@@ -1,6 +1,7 @@
 """Open places: how rare they are, among scored places and all over a map, and what another one is worth then."""
 
 from dataclasses import dataclass, replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -9,7 +10,7 @@ from trackers import observed
 
 from coview_stream.localization.evidence.background import Background
 from coview_stream.localization.evidence.likelihood import log_likelihood_ratios
-from coview_stream.localization.evidence.observation import Observations, ObservedScan
+from coview_stream.localization.evidence.observation import ObservedScan
 from coview_stream.localization.evidence.open_places import OpenPlaces
 
 KNOWN = Background(CHANCE, PASSED, (0.8, 8.0), (30.0, 60.0))
@@ -96,7 +97,7 @@ class EastwardRoads:
     def look_up(self, field, poses, move):
         x, _, z, heading = poses.T
         fits = (np.abs(z - 100.0) < 1.0) & (np.cos(heading) > 0.8) & (x < self.end)
-        return Observations(poses, np.where(fits[:, None], CLEAR[:1], ROUGH[:1]), np.zeros((len(poses), 5)))
+        return SimpleNamespace(poses=poses, shares=np.where(fits[:, None], CLEAR[:1], ROUGH[:1]))
 
 
 @dataclass(frozen=True)
