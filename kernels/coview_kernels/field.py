@@ -79,7 +79,10 @@ class FieldScores(NamedTuple):
 
 @dataclass(frozen=True)
 class FieldScan:
-    """A levelled scan relative to the pivot, metres; neighbouring points follow one another."""
+    """A levelled scan relative to the pivot, metres; neighbouring points follow one another.
+
+    Its arrays must not change, as they are copied once for the kernel.
+    """
 
     structure: F32
     """(N, 3) points above the ground."""
@@ -148,7 +151,7 @@ class FieldMap:
         for name, kind, shape in (
             ("table", np.int32, table.shape),
             ("base", np.float32, base.shape),
-            ("bits", np.int64, (tiles, TILE, TILE, 2)),
+            ("words", np.int64, (tiles, TILE, TILE, 2)),
             ("surface", np.int32, (tiles, TILE, TILE)),
             ("coarse", np.uint16, _coarse_shape(rows, columns)),
         ):
@@ -173,6 +176,10 @@ class FieldMap:
         """Kernel with the :attr:`layers`."""
         return FieldKernel(self.layers)
 
+    def __getstate__(self) -> dict[str, Any]:
+        """Return the state without the prepared launch."""
+        return {name: value for name, value in self.__dict__.items() if name != "kernel"}
+
     def made_layers(
         self, zeros: Zeros = lambda _, shape, kind: np.zeros(shape, kind), done: Callable[[], object] = lambda: None
     ) -> FieldLayers:
@@ -182,7 +189,7 @@ class FieldMap:
         """
         table, base = self._table()
         tiles = len(base)
-        bits = zeros("bits", (tiles, TILE, TILE, 2), np.int64)
+        bits = zeros("words", (tiles, TILE, TILE, 2), np.int64)
         surface = zeros("surface", (tiles, TILE, TILE), np.int32)
         surface[:1] = NOT_SURVEYED & 0xFFFF
         for start in range(0, tiles - 1, _BATCH):
@@ -238,7 +245,7 @@ def _groups(layers: FieldLayers, start: F64) -> Iterator[slice | I64]:
 
     Pages of neighbouring windows that the scan reaches stay in memory until the last group is done.
     """
-    windows = Windows(layers.bits)
+    windows = Windows(layers.words)
     if not windows.several:
         yield slice(None)
         return
@@ -291,7 +298,7 @@ class FieldKernel:
     """The kernel with the layers of a map; its launch keeps them and the points of the last scan."""
 
     def __init__(self, layers: FieldLayers) -> None:
-        bits, first = layers.bits.reshape(-1), 0
+        bits, first = layers.words.reshape(-1), 0
         if len(bits) > _MIDDLE:
             bits, first = bits[_MIDDLE:], -_MIDDLE
         self._of_map = (
@@ -314,6 +321,7 @@ class FieldKernel:
         else:
             new = rest if self._columns is scan.columns else (*scan.columns, *rest)
             count = len(self._of_map) + len(scan.columns) + len(rest)
+            self._columns = ()  # an interrupt may leave columns of both scans
             for index, value in enumerate(new, count - len(new)):
                 self._launch.put(index, value)
         self._columns = scan.columns
@@ -346,7 +354,7 @@ def _fill_near(bits: I64, table: I32, done: Callable[[], object]) -> None:
 
 
 def _packed(near: U64, on: U64) -> I64:
-    """Return the words (..., 2) of :attr:`FieldLayers.bits` from the bits (...) of all 64 heights."""
+    """Return the words (..., 2) of :attr:`FieldLayers.words` from the bits (...) of all 64 heights."""
     return np.stack([(near & _LOWER) | (on << _HALF), (near >> _HALF) | (on & ~_LOWER)], axis=-1).view(np.int64)
 
 

@@ -48,7 +48,7 @@ class Launch:
     def put(self, index: int, value: Any) -> None:
         """Replace an argument for later calls."""
         self._arguments[index] = value
-        if self._program is not None:
+        if self.ready():
             _set_argument(self._context, index, value)
 
     def ready(self) -> bool:

@@ -49,6 +49,7 @@ class OwnerThread:
         while (job := self._jobs.get()) is not None:
             with self._busy:
                 job.run()
+            del job  # else its arguments live until the next one
 
     def call(self, fn: Callable[[], R]) -> R:
         """Run ``fn()`` on the thread, and return its result or raise its error; StoppedError after :meth:`stop`."""
@@ -68,8 +69,8 @@ class OwnerThread:
     def here(self, fn: Callable[[], R]) -> R:
         """Run ``fn()`` on the caller's thread while no other call runs.
 
-        ``fn`` must be short, and must not use :meth:`call` or :meth:`here`. A signal handler of the caller must not use
-        them either, as it would wait for the call that it interrupts.
+        Others wait for ``fn``, which must not use :meth:`call` or :meth:`here`. A signal handler of the caller must not
+        use them either, as it would wait for the call that it interrupts.
         """
         if threading.current_thread() is self._thread:
             return fn()

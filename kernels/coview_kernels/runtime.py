@@ -5,7 +5,7 @@ system library except libc and starts in half the time (commit 731ba9db, bench/s
 
 Taichi starts at the first kernel, not at import, and belongs to one thread: a program must be initialised and first
 launched on the same thread, and concurrent launches sometimes fail. One daemon thread owns it and takes calls from a
-queue, while callers wait; short prepared launches run on the caller's thread while the owner waits.
+queue, while callers wait; frequent prepared launches run on the caller's thread while the owner waits.
 
 * ``COVIEW_KERNELS`` = ``quadrants``, ``taichi`` or ``numpy`` forces a backend; the default is the first usable one.
 * ``COVIEW_THREADS`` = 1, 2, ... bounds the threads of a kernel; the default is all cores of the process, up to 16.
@@ -367,8 +367,8 @@ def dispatch_here(
 ) -> R:
     """Dispatch as :func:`dispatch` does, but run ``native`` on the caller's thread if ``ready()``; the owner waits.
 
-    For short kernels: waking the owner, and then the caller, takes 0.25 ms if cores sleep. ``native`` may only launch
-    prepared kernels (:meth:`coview_kernels.launch.Launch.ready`), and hands nothing to the owner.
+    For frequent kernels: waking the owner, and then the caller, takes 0.25 ms if cores sleep. ``native`` may only
+    launch prepared kernels (:meth:`coview_kernels.launch.Launch.ready`), and hands nothing to the owner.
     """
     owner = _owner
     if owner is not None:

@@ -1,5 +1,7 @@
 """Scores against a likelihood field: the kernel as its twin, and both as plain geometry."""
 
+import copy
+import pickle
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -126,9 +128,9 @@ def test_one_map_scores_one_scan_after_another(scene: Scene):
     second = kernels.field_scores(field, other, others[:7])
     assert len(second.pose) == 7
     assert second.structure.max() <= len(other.structure) < first.structure.max()
-    alone = replace(field)
-    for one, again in zip(kernels.field_scores(alone, other, others[:7]), second, strict=True):
-        np.testing.assert_array_equal(one, again)
+    for alone in (replace(field), copy.deepcopy(field), pickle.loads(pickle.dumps(field))):
+        for one, again in zip(kernels.field_scores(alone, other, others[:7]), second, strict=True):
+            np.testing.assert_array_equal(one, again)
     for one, again in zip(kernels.field_scores(field, scan, others), first, strict=True):
         np.testing.assert_array_equal(one, again)
 
@@ -189,7 +191,7 @@ def test_layers_made_in_small_batches_are_the_same(scene: Scene, monkeypatch: py
     assert whole.table.shape[0] > 4
     names = []
     made = field.made_layers(lambda name, shape, kind: names.append(name) or np.zeros(shape, kind))
-    assert names == ["bits", "surface", "coarse"]
+    assert names == ["words", "surface", "coarse"]
     for one, other in zip(made, whole, strict=True):
         np.testing.assert_array_equal(one, other)
 
@@ -209,9 +211,9 @@ def test_field_of_a_file_is_gone_through_by_windows_with_the_same_scores(
     scene: Scene, tmp_path: Path, windows: Callable[[int, int], None]
 ):
     field, scan, pose, others = scene
-    np.save(tmp_path / "bits.npy", field.layers.bits)
+    np.save(tmp_path / "bits.npy", field.layers.words)
     bits = np.load(tmp_path / "bits.npy", mmap_mode="r")
-    stored = replace(field, stored=field.layers._replace(bits=bits))
+    stored = replace(field, stored=field.layers._replace(words=bits))
     windows(1 << 14, 2 * bits[0].nbytes)
     assert len(list(Windows(bits))) == 5
     assert stored.layers is stored.stored
@@ -228,13 +230,13 @@ def test_tiles_beyond_what_32_bits_count_are_looked_up(scene: Scene, tmp_path: P
     number = np.where(layers.table > 4, layers.table + last, layers.table)
     far = np.concatenate([[0], np.unique(number[number > 0])])
     sparse = {}
-    for name in ("base", "bits", "surface"):
+    for name in ("base", "words", "surface"):
         own = getattr(layers, name)
         made = np.memmap(tmp_path / name, own.dtype, "w+", shape=(last + len(own), *own.shape[1:]))
         made[far] = own
         sparse[name] = made
     large = layers._replace(table=number.astype(np.int32), **sparse)
-    assert large.bits.size > 2**31
+    assert large.words.size > 2**31
     corner = np.array([*field.corner[::-1] * 16.0, 0.0, 0.0])
     starts = np.vstack([others, pose]) - corner
     plan = Plan(*scan.parts, 2, True)

@@ -5,6 +5,7 @@ import subprocess
 import sys
 import threading
 import time
+import weakref
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
@@ -142,6 +143,32 @@ def test_shutdown_is_idempotent_and_the_next_kernel_starts_again():
     assert not any(t.name == "coview-kernels" for t in threading.enumerate())
     assert polar_bin(np.ones((3, 3)), (0, 0, 0), 1, 1, 9.0)[0].count[0, 0] == 3
     assert backend() == before
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(len(LIBRARIES) < 2, reason="needs both libraries")
+def test_prepared_launches_follow_a_change_of_the_library():
+    code = (
+        "import os\n"
+        "x, y = np.meshgrid(np.arange(9.0), np.arange(9.0))\n"
+        "many = np.stack([x, y, 0 * x], axis=-1).reshape(-1, 3)\n"
+        "both = set()\n"
+        "for name in ('quadrants', 'taichi', 'numpy', 'quadrants'):\n"
+        "    os.environ['COVIEW_KERNELS'] = name\n"
+        "    ck.shutdown()\n"
+        "    both.add(tuple(ck.distinct_poses(many, np.zeros(81), 20, 1.5, 0.1).tolist()))\n"
+        "    use()\n"
+        "assert len(both) == 1\n"
+    )
+    succeeds(code)
+
+
+def test_no_argument_of_the_last_call_is_kept():
+    used = np.ones((5, 3), dtype=np.float32)
+    submit(lambda points: len(points), used)
+    kept = weakref.ref(used)
+    del used
+    until(lambda: kept() is None)
 
 
 def test_shutdown_while_other_threads_compute_loses_no_call():

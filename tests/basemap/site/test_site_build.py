@@ -198,10 +198,10 @@ def test_working_file_is_compared_with_its_checksum_once_and_made_again_where_it
 @pytest.mark.slow
 def test_working_file_holds_the_rasters_that_are_looked_up_and_one_file_does_not(site, cache, tmp_path):
     base_map = BaseMap.load(site)
-    assert isinstance(base_map.field.layers.bits, np.memmap)
+    assert isinstance(base_map.field.layers.words, np.memmap)
     base_map.save(tmp_path / "one.coview")
     one = BaseMap.load(tmp_path / "one.coview")
-    assert not isinstance(one.field.layers.bits, np.memmap)
+    assert not isinstance(one.field.layers.words, np.memmap)
     assert one.nbytes == base_map.nbytes
     for stored, made in zip(base_map.field.layers, one.field.layers, strict=True):
         np.testing.assert_array_equal(stored, made)
@@ -215,19 +215,19 @@ def test_rasters_of_a_shared_map_are_made_once_in_the_cache_if_there_is_one(worl
         return base_map
 
     first = shared()
-    assert isinstance(first.field.layers.bits, np.memmap)
+    assert isinstance(first.field.layers.words, np.memmap)
     assert first.nbytes == world_map.nbytes
     (made,) = cache.glob("*.coview")
     made.write_bytes(made.read_bytes()[:-1])  # a damaged one is made again
     monkeypatch.setenv("COVIEW_CACHE", str(world_file))
     alone = shared()
-    assert not isinstance(alone.field.layers.bits, np.memmap)
+    assert not isinstance(alone.field.layers.words, np.memmap)
     monkeypatch.setenv("COVIEW_CACHE", str(cache))
     again = shared()
     for base_map in (alone, again):
         for stored, wanted in zip(base_map.field.layers, world_map.field.layers, strict=True):
             np.testing.assert_array_equal(stored, wanted)
-    assert isinstance(again.field.layers.bits, np.memmap)
+    assert isinstance(again.field.layers.words, np.memmap)
 
 
 @pytest.mark.slow
