@@ -65,7 +65,7 @@ class Topic(NamedTuple):
     """Codec of messages without Encoding."""
     depth: int = 0
     codec: str | None = None
-    """Codec of all messages, whatever their Encoding says."""
+    """Codec of all messages; their Encoding is ignored."""
 
     def robot_of(self, sample: Sample) -> str:
         """Return the robot that a sample belongs to."""

@@ -77,11 +77,13 @@ def both_bits(bits: ti.template(), at, level) -> ti.i64:
 
 @ti.func
 def near_bit(word) -> ti.i32:
+    """Return whether there is structure near, of a word of :func:`both_bits`."""
     return ti.cast(word & 1, ti.i32)
 
 
 @ti.func
 def on_bit(word) -> ti.i32:
+    """Return whether there is structure, of a word of :func:`both_bits`."""
     return ti.cast((word >> 32) & 1, ti.i32)
 
 
