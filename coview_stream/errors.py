@@ -80,7 +80,7 @@ def nearest(given: str, known: Sequence[str]) -> str | None:
     """Return the known name that is most similar to a mistyped one; None if none is similar."""
     from difflib import get_close_matches
 
-    bare = {name.lstrip("-"): name for name in known}  # dashes of options are no similarity
+    bare = {name.lstrip("-"): name for name in known}  # dashes of options do not make names similar
     near = get_close_matches(given.lstrip("-"), bare, 1, cutoff=0.65)  # at 0.6 merge is serve
     return bare[near[0]] if near else None
 

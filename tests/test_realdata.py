@@ -87,7 +87,7 @@ def test_real_run_is_localized_on_an_airborne_like_map(tmp_path):
 @pytest.mark.slow
 @pytest.mark.parametrize("located", ["kitti04"], indirect=True)
 def test_real_run_on_wrong_map_gets_no_pose(located, tmp_path):
-    """The handheld run is no part of the street."""
+    """The handheld run is not a part of the street."""
     _, _, _, out = located
     code = main(
         ["locate", str(out / "site.coview"), str(data("handheld_livox", "run")), "-o", str(tmp_path), "--no-pictures"]

@@ -72,7 +72,7 @@ class BaseMap:
             self.crs: str | None = parameters["crs"]
             self.sources: dict[str, str] = dict(parameters["sources"])
             if not isinstance(self.crs, str | None):
-                raise TypeError("crs is no text")
+                raise TypeError("crs is not text")
             json.dumps(parameters, ensure_ascii=False).encode()  # refuse lone surrogates: they cannot be printed
         except (KeyError, TypeError, ValueError, AttributeError, OverflowError) as error:
             raise MapError(f"the map's parameters cannot be read ({error}); build it again") from error
@@ -102,7 +102,7 @@ class BaseMap:
                 (N, 3), all in one frame, metres, z up; give large coordinates (UTM) as float64.
             preset: ``slam`` (radius 50 m) or ``tls`` (100 m).
             config: replaces preset and options.
-            progress: show a bar on stderr, or one line per stage where stderr is no terminal.
+            progress: show a bar on stderr, or one line per stage where stderr is not a terminal.
             crs: reference system of arrays, and of files that state none: ``EPSG:code`` or WKT; or "feet",
                 "us-feet". Feet are converted to metres.
             options: fields of :class:`MapConfig` or :class:`DescriptorConfig`.

@@ -20,7 +20,7 @@ from coview_stream.clouds.progress import Progress, staged_bar
 from coview_stream.config import MapConfig
 from coview_stream.errors import MapError, warn
 
-_MIN_POINTS = 1000  # after cleaning; fewer are no site
+_MIN_POINTS = 1000  # after cleaning; fewer are not a site
 
 _SHARES = {
     "reading": 0.04, "cleaning, finding normals": 0.18, "finding the ground": 0.07, "describing stations": 0.03,

@@ -137,7 +137,7 @@ def check_target(path: Path) -> None:
     """Refuse to replace anything but a map.
 
     Raises:
-        MapError: the path is a directory, a device or a file that is no map, or its directory does not exist.
+        MapError: the path is a directory, a device or a file that is not a map, or its directory does not exist.
     """
     if path.is_dir() or not path.resolve().parent.is_dir():
         raise MapError(f"{path}: not a place for a file; give a name in a directory that exists")
@@ -152,7 +152,7 @@ def check_target(path: Path) -> None:
         except (MapError, OSError):
             header = {}
         if header.get("__metadata__", {}).get("format") != FORMAT:
-            raise MapError(f"{path}: exists and is no coview map; delete it or give another name")
+            raise MapError(f"{path}: exists and is not a coview map; delete it or give another name")
 
 
 def _header_bytes(header: dict[str, Any]) -> bytes:
@@ -230,7 +230,7 @@ def open_file(
                 digest = _digest(metadata["parameters"], arrays, lambda name: _read(file, start, header[name]))
             parameters = json.loads(metadata["parameters"])
             if not isinstance(parameters, dict):
-                raise TypeError("its parameters are no object")
+                raise TypeError("its parameters are not an object")
         except _DAMAGE as error:
             raise MapError(f"{path}: the map is damaged or truncated ({error}); copy or build it again") from error
         if digest != metadata.get("sha256"):
@@ -241,7 +241,7 @@ def open_file(
 
 
 def signer(path: Path) -> str | None:
-    """Return the unverified fingerprint of a map's signing key, None if unsigned; MapError if the file is no map."""
+    """Return the unverified fingerprint of a map's signing key, None if unsigned; MapError if the file is not a map."""
     with _opened(path) as file:
         metadata = _header(path, file)[0].get("__metadata__", {})
     return str(metadata.get("signer")) if "signature" in metadata else None
@@ -279,7 +279,7 @@ def _mapped(file: BinaryIO, size: int, start: int, entry: dict[str, Any]) -> npt
     shape = tuple(entry["shape"])
     begin, end = entry["data_offsets"]
     if not all(type(n) is int and n >= 0 for n in (*shape, begin, end)):
-        raise ValueError("a shape or an offset is no natural number")
+        raise ValueError("a shape or an offset is not a natural number")
     if end - begin != dtype.itemsize * math.prod(shape) or start + end > size:
         raise ValueError("an array reaches beyond the file")
     if end == begin:

@@ -104,9 +104,9 @@ def _part(row: Mapping[str, Any]) -> MapPart:
     numbers = [float(value) for value in (*row["shift"], *row["x"])]
     name, sha256, crs = row["name"], row["sha256"], row["crs"]
     if len(numbers) != 5 or not all(abs(value) <= _MAX_METRES for value in numbers):
-        raise ValueError("shift or x are no lengths")
+        raise ValueError("shift or x are not lengths")
     if not (isinstance(name, str) and 0 < len(name) <= _MAX_NAME and name.isprintable()):
         raise ValueError("a name is empty, too long or not printable")
     if not isinstance(sha256, str) or not isinstance(crs, str | None):
-        raise ValueError("sha256 or crs is no text")
+        raise ValueError("sha256 or crs is not text")
     return MapPart(name, sha256, crs, (numbers[0], numbers[1], numbers[2]), numbers[3], numbers[4])

@@ -102,7 +102,7 @@ def sources_of(given: Given | Sequence[Given], crs: str | None = None) -> list[S
 
     Raises:
         MapError: there is no source, or a file is named twice. CloudError: an array, folder or pattern has no cloud.
-        ConfigError: ``crs`` is no text, or no system in metres.
+        ConfigError: ``crs`` is not text, or no system in metres.
     """
     if not isinstance(crs, str | None):
         raise ConfigError(f"crs is {crs!r}; give text such as 'EPSG:28992', or WKT")

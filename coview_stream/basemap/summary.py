@@ -303,22 +303,22 @@ class MapView:
         ground: Any = data.get("ground")
         for name, value in (("count", count), ("ground", ground)):
             if type(value) is not int or not 0 <= value <= _MAX_POINTS:
-                raise MessageError(f"map view: {name} is no number of points up to {_MAX_POINTS}")
+                raise MessageError(f"map view: {name} is not a number of points up to {_MAX_POINTS}")
         step: Any = data.get("step_m")
         crs, sha256 = data.get("crs"), data.get("map_sha256")
         origin = data.get("origin")
         if ground > count:
             raise MessageError(f"map view: ground is {ground} of {count} points")
         if not _finite(step, 10.0) or step <= 0:
-            raise MessageError("map view: step_m is no length of at most 10 m")
+            raise MessageError("map view: step_m is not a length of at most 10 m")
         if not isinstance(origin, list) or len(origin) != 3 or not all(_finite(c, _MAX_COORDINATE) for c in origin):
-            raise MessageError("map view: origin is no list of three coordinates")
+            raise MessageError("map view: origin is not a list of three coordinates")
         if not isinstance(sha256, str) or not (crs is None or isinstance(crs, str)):
             raise MessageError("map view: map_sha256 and crs have to be text")
         try:
             packed = base64.b64decode(data.get("points", ""), validate=True)
         except (binascii.Error, TypeError, ValueError) as error:
-            raise MessageError("map view: points are no base64") from error
+            raise MessageError("map view: points are not base64") from error
         if len(packed) != 6 * count:
             raise MessageError(f"map view: {len(packed)} bytes for {count} points")
         points = np.frombuffer(packed, dtype="<i2").reshape(-1, 3).astype(np.float32) * np.float32(step)

@@ -283,5 +283,5 @@ def _read_stdin(folder: Path) -> Path:
     if not path.stat().st_size:
         raise CloudError("stdin: nothing came (0 bytes)")
     if suffix is None:
-        raise CloudError("-: stdin is no cloud of a format that its first bytes tell; write it to a file")
+        raise CloudError("-: stdin is not a cloud of a format that its first bytes tell; write it to a file")
     return path.rename(path.with_suffix(suffix))

@@ -42,7 +42,9 @@ def run(args: argparse.Namespace) -> int:
     check_map_name(args.output, directory=args.light or not args.map.is_dir())
     if args.light:
         if not args.map.is_dir():
-            raise ConfigError(f"{args.map}: is no directory of tiles; convert it to one first, then that with --light")
+            raise ConfigError(
+                f"{args.map}: is not a directory of tiles; convert it to one first, then that with --light"
+            )
         with naming_missing_libraries("coview-stream convert", "node"), progress_bar("converting", unit="step") as step:
             site = lighten(args.map, output, key, step)
         _tell(output, site)

@@ -63,15 +63,19 @@ def run(args: argparse.Namespace) -> int:
     if args.json:
         print(json.dumps({"format": 1, "findings": [finding.to_json() for finding in findings]}, indent=1))
     else:
-        print(_conclusion(findings))
+        print(_conclusion(findings, args))
     return 1 if failed(findings) else 0
 
 
-def _conclusion(findings: list[Finding]) -> str:
-    """Return the last line: no problem, or how many problems and warnings there are, and the page about them."""
+def _conclusion(findings: list[Finding], args: argparse.Namespace) -> str:
+    """Return the last line: no problem and with whom, or how many problems and warnings, and the page about them."""
     problems, warnings = (sum(finding.verdict == verdict for finding in findings) for verdict in ("FAIL", "warn"))
     if not problems + warnings:
-        return "no problem found (a delay or a wrong mount shows only in turns)"
+        asked = {"the map": args.map, "the run": args.run_path, "the robots": args.robot}
+        checked = " and ".join(["this machine", *(name for name, given in asked.items() if given)])
+        clouds = args.run_path or args.robot
+        more = "a delay or a wrong mount shows only in turns" if clouds else "clouds were not checked: --robot, --run"
+        return f"no problem found with {checked} ({more})"
     counts = [counted(count, kind) for count, kind in ((problems, "problem"), (warnings, "warning")) if count]
     return f"{', '.join(counts)}; symptoms and remedies: `coview-stream help reasons`"
 

@@ -69,8 +69,8 @@ def run(args: argparse.Namespace) -> int:
             from coview_stream.report.relief import plot_map
 
             plot_map(base_map, args.plot, args.map.name)
-        if not args.json:
-            facts["written"] = str(args.plot)
+    if not args.json and (written := [str(file) for file in (args.output, args.plot) if file]):
+        facts["written"] = ", ".join(written)
     if args.json:
         print(json.dumps({"format": 1} | facts, indent=1))
     else:

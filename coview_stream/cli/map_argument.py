@@ -44,7 +44,7 @@ def check_map_name(output: str, directory: bool) -> None:
         raise ConfigError(f"{output}: a directory of tiles is written, which is no such file; call it {path.stem}/")
     if not directory and path.suffix not in ("", ".coview"):
         raise ConfigError(
-            f"{output}: a map is written, which is no {path.suffix}; call it {path.stem}.coview, or {path.stem}/ for a "
+            f"{output}: a map is written, not a {path.suffix}; call it {path.stem}.coview, or {path.stem}/ for a "
             "directory of tiles"
         )
 
@@ -97,7 +97,7 @@ def local_map(
         return LocalMap(path)
     if not is_site(path):
         raise ConfigError(
-            f"--around: {name} is no directory of tiles; `coview-stream build CLOUDS -o DIRECTORY/` makes one, "
+            f"--around: {name} is not a directory of tiles; `coview-stream build CLOUDS -o DIRECTORY/` makes one, "
             "`convert` one of a .coview file"
         )
     return LocalMap(part_file(path, Manifest.load(path).tiles_around(circle), str(circle)))

@@ -155,7 +155,7 @@ def host_port(option: str, example: str) -> Callable[[str], str]:
 
     def check(text: str) -> str:
         if not text.rpartition(":")[2].isdecimal():  # for example the map after an option without value
-            raise argparse.ArgumentTypeError(f"{text!r} is no HOST:PORT; write {option}={example}")
+            raise argparse.ArgumentTypeError(f"{text!r} is not HOST:PORT; write {option}={example}")
         return text
 
     return check
@@ -332,7 +332,7 @@ def check_picture(option: str, path: Path | None) -> None:
     if path.is_dir():
         raise ConfigError(f"{option} {path}: is a directory; name the picture, such as {path / 'picture.png'}")
     if not path.parent.is_dir():
-        raise ConfigError(f"{option} {path}: {path.parent} is no directory; make it first")
+        raise ConfigError(f"{option} {path}: {path.parent} is not a directory; make it first")
 
 
 def mount_of(args: argparse.Namespace) -> Mount | None:

@@ -139,7 +139,7 @@ def decode_in_child(path: Path, builder: CloudBuilder) -> None:
 def copy_window(source: str, low: tuple[float, float], high: tuple[float, float], target: Path) -> dict[str, int]:
     """Write the points in a window of a COPC file to a LAS file, in the shared child; return the fields of ``Fetched``.
 
-    CloudError if the file cannot be read or is no COPC file, or if the window has no points.
+    CloudError if the file cannot be read or is not a COPC file, or if the window has no points.
     """
     answer = _shared.ask({"path": source, "low": low, "high": high, "target": str(target)})
     return {name: answer[name] for name in ("points", "received", "requests")}

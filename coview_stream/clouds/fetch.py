@@ -96,7 +96,7 @@ def fetch_cloud(source: str | os.PathLike[str], folder: Path, window: Window | N
     """Write a cloud from a web server, or a window of a COPC file, into a folder; return the new file, and counts.
 
     Raises:
-        CloudError: the source cannot be read or is no COPC file, or the window has no points.
+        CloudError: the source cannot be read or is not a COPC file, or the window has no points.
         OSError: the file cannot be written.
     """
     name = PurePosixPath(unquote(urlsplit(str(source)).path)).name if is_web_address(source) else Path(source).name

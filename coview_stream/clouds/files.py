@@ -97,7 +97,7 @@ def natural_key(path: Path) -> tuple[tuple[int, int, str], ...]:
 
 
 def suffix_of_content(head: bytes) -> str | None:
-    """Return the suffix for a cloud's first bytes, by default the suffix of text; None if they are no cloud's."""
+    """Return the suffix for a cloud's first bytes, by default the suffix of text; None if they are not a cloud's."""
     content = sniff(head)
     if content == "gzip":
         return ".xyz.gz"

@@ -153,7 +153,7 @@ def _damage_of(path: Path) -> Iterator[None]:
     except (CloudError, MemoryError):
         raise
     except BaseException as error:
-        # a panic of the LAZ decoder, written in Rust, is no Exception
+        # a panic of the LAZ decoder, written in Rust, is not an Exception
         if not isinstance(error, Exception) and type(error).__name__ != "PanicException":
             raise
         reason = " ".join(str(error).split())[:160] or type(error).__name__

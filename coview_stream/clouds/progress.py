@@ -45,7 +45,7 @@ def progress_bar(
 def staged_bar(shares: Mapping[str, float], show: bool) -> Iterator[Callable[[str], Progress]]:
     """Show one bar for successive stages, with the time left, and yield the function that begins a stage.
 
-    If stderr is no terminal, each stage prints a line instead, once the work has taken ten seconds.
+    If stderr is not a terminal, each stage prints a line instead, once the work has taken ten seconds.
 
     Args:
         shares: share of each stage in the whole time, in order.

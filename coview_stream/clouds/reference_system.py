@@ -81,7 +81,7 @@ def flaw_of_name(text: str) -> str | None:
         return None
     system = parse_system(text)
     if system is None:
-        return "is no reference system; give EPSG:code, WKT, feet or us-feet"
+        return "is not a reference system; give EPSG:code, WKT, feet or us-feet"
     if system.is_geographic:
         return "is in degrees; give the system of metres that the coordinates are in"
     return None

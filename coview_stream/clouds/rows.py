@@ -48,7 +48,7 @@ def read_text(path: Path) -> Cloud:
     """Read x, y and z (metres) from text, in the first three columns or those that a title line names.
 
     Spaces, tabs, commas or semicolons separate the columns. Other columns, lines that begin with #, //, ; or %, and
-    the numbers of points in a PTS file are skipped. CloudError names a line that is no point.
+    the numbers of points in a PTS file are skipped. CloudError names a line that is not a point.
     """
     builder = CloudBuilder()
     try:
@@ -104,7 +104,9 @@ def _begin(path: Path, stream: TextIO) -> tuple[str | None, tuple[int, ...], lis
     columns: tuple[int, ...] = (0, 1, 2)
     for number, line in enumerate(islice(stream, _MAX_HEAD), start=1):
         if len(line) > _MAX_LINE:
-            raise CloudError(f"{path}:{number}: a line of {len(line)} characters is no point; write one point a line")
+            raise CloudError(
+                f"{path}:{number}: a line of {len(line)} characters is not a point; write one point a line"
+            )
         text = line.strip()
         if not text or text.startswith(_COMMENTS):
             columns = _titled_columns(text.lstrip("#/;% ")) or columns
@@ -121,7 +123,7 @@ def _begin(path: Path, stream: TextIO) -> tuple[str | None, tuple[int, ...], lis
             raise CloudError(f"{path}:{number}: {text[:60]!r} has {len(cells)} columns; a point needs x, y and z")
         titled = _titled_columns(text)
         if titled is None and any(map(_is_number, cells)):
-            raise CloudError(f"{path}:{number}: {text[:60]!r} is no point; write x y z, in metres")
+            raise CloudError(f"{path}:{number}: {text[:60]!r} is not a point; write x y z, in metres")
         columns = titled or columns
     raise CloudError(f"{path}: no point in the first {_MAX_HEAD} lines; write one point a line: x y z")
 
@@ -148,7 +150,7 @@ def _numbers(path: Path, rows: list[str], separator: str | None, columns: tuple[
             continue
         words = [cell.strip().strip('"') for cell in row.strip("\r\n ").split(separator)]
         if len(words) <= max(columns) or not all(_is_number(words[k]) for k in columns):
-            raise CloudError(f"{path}:{number + at}: {row.strip()[:60]!r} is no point; write x y z, in metres")
+            raise CloudError(f"{path}:{number + at}: {row.strip()[:60]!r} is not a point; write x y z, in metres")
         cells.append([float(words[k]) for k in columns])
     return np.array(cells, dtype=np.float64).reshape(-1, 3)
 
@@ -203,7 +205,7 @@ def read_bin(path: Path) -> Cloud:
     if size % (4 * columns):
         dataset, names = ("nuScenes", "x, y, z, intensity, ring") if nuscenes else ("KITTI", "x, y, z, intensity")
         raise CloudError(
-            f"{path}: {size} bytes are no multiple of a {dataset} row ({4 * columns} bytes: float32 {names}); "
+            f"{path}: {size} bytes are not a multiple of a {dataset} row ({4 * columns} bytes: float32 {names}); "
             "truncated, or of another layout: copy it again or convert it to PCD or PLY"
         )
     values = np.fromfile(path, dtype="<f4")

@@ -48,7 +48,7 @@ def read_kitti_poses(path: str | os.PathLike[str]) -> Poses:
     wrong = np.abs(R @ R.transpose(0, 2, 1) - np.eye(3)).max(axis=(1, 2)) > _ROTATION_TOLERANCE
     wrong |= np.linalg.det(R) <= 0
     if wrong.any():
-        raise RunError(f"{path}:{lines[int(np.argmax(wrong))]}: the 3x3 part is no rotation; check the columns")
+        raise RunError(f"{path}:{lines[int(np.argmax(wrong))]}: the 3x3 part is not a rotation; check the columns")
     poses = np.tile(np.eye(4), (len(rows), 1, 1))
     if len(rows):
         poses[:, :3, :3] = nearest_rotation(R)
@@ -110,7 +110,7 @@ def _words(path: Path) -> list[tuple[int, list[str]]]:
     except IsADirectoryError as error:
         raise RunError(f"{path}: is a directory; name the trajectory file") from error
     except UnicodeDecodeError as error:
-        raise RunError(f"{path}: is no text; give a trajectory as numbers in lines") from error
+        raise RunError(f"{path}: is not text; give a trajectory as numbers in lines") from error
     except (OSError, ValueError) as error:
         raise RunError(f"{path}: cannot be read ({error}); check path and permissions") from error
     numbered = ((number, line.split()) for number, line in enumerate(text.splitlines(), start=1))

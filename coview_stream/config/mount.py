@@ -107,7 +107,7 @@ def parse_mount(text: str) -> Mount:
     if max(abs(angle) for angle in numbers[:3]) > 360.0:
         raise ConfigError(f"{given}: an angle is beyond 360 degrees; {shape}")
     if any(abs(metres) > MAX_LEVER for metres in numbers[3:]):
-        raise ConfigError(f"{given}: a sensor {MAX_LEVER:g} m away is no mount; metres follow the angles")
+        raise ConfigError(f"{given}: a sensor {MAX_LEVER:g} m away is not a mount; metres follow the angles")
     drawn = len(numbers) == 6 or not any(numbers)
     roll, pitch, yaw = (math.radians(angle) for angle in numbers[:3])
     x, y, z = numbers[3:] or (0.0, 0.0, 0.0)

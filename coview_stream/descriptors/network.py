@@ -246,7 +246,7 @@ def network(view: ViewName, threads: int | None = None) -> Network:
     """Return the encoder of a view, loaded once, by default with the kernels' number of threads.
 
     Raises:
-        InputError: as :class:`Network`. ConfigError: COVIEW_THREADS is no number.
+        InputError: as :class:`Network`. ConfigError: COVIEW_THREADS is not a number.
     """
     if threads is None:
         try:

@@ -228,7 +228,7 @@ def try_tcp(endpoint: str) -> str:
     except ConnectionRefusedError:
         return "refuses: nothing listens there"
     except socket.gaierror:
-        return "is no host that is known here"
+        return "is not a host known here"
     except TimeoutError:
         return "does not answer: off, or behind a firewall"
     except OSError as error:

@@ -194,7 +194,7 @@ def _read_result(path: Path) -> dict[str, Any]:
     except (OSError, ValueError, RecursionError) as error:
         raise InputError(f"{path}: cannot be read as a result of `locate` ({error}); run it again") from error
     if not isinstance(result, dict):
-        raise InputError(f"{path}: is no result of `locate`; run it again")
+        raise InputError(f"{path}: is not a result of `locate`; run it again")
     return result
 
 

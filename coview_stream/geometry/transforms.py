@@ -200,7 +200,7 @@ def is_pose(T: Reals) -> bool:
 
 
 def why_no_pose(T: Reals) -> str:
-    """Return a clause on why a matrix is no pose (:func:`is_pose`), with the remedy."""
+    """Return a clause on why a matrix is not a pose (:func:`is_pose`), with the remedy."""
     if T.shape != (4, 4):
         flaw = f"it has shape {T.shape}; give a 4x4 matrix"
     elif not np.isfinite(T).all():
@@ -213,7 +213,7 @@ def why_no_pose(T: Reals) -> str:
         flaw = "it mirrors (determinant -1); axes have to be right-handed"
     else:
         flaw = f"its last row is {T[3].tolist()}; give 0 0 0 1"
-    return f"is no rigid transform: {flaw}"
+    return f"is not a rigid transform: {flaw}"
 
 
 def interpolate(T_start: Poses, T_end: Poses, share: npt.ArrayLike) -> Poses:

@@ -32,7 +32,7 @@ _MIN_EIGENVALUE = 1e-12  # of a correlation matrix
 def to_array(
     values: npt.ArrayLike, dtype: type[_Real], name: str, error: type[InputError] = CloudError
 ) -> npt.NDArray[_Real]:
-    """Return ``values`` as an array of ``dtype``, copied only if needed; ``error`` if they are no numbers."""
+    """Return ``values`` as an array of ``dtype``, copied only if needed; ``error`` if they are not numbers."""
     try:
         with np.errstate(over="ignore"):
             array = np.asarray(values)
@@ -67,7 +67,7 @@ def finite_rows(rows: Points) -> tuple[Points, Bools | None]:
 
 
 def validate_cloud(cloud: npt.ArrayLike) -> Points:
-    """Return a copy of a frame's finite points, row-major (N, 3) float32; CloudError if it is no cloud."""
+    """Return a copy of a frame's finite points, row-major (N, 3) float32; CloudError if it is not a cloud."""
     finite, _ = finite_rows(cloud_rows(cloud))
     if len(finite) < _MIN_POINTS:
         raise CloudError(f"cloud has {len(finite)} finite points; a frame needs {_MIN_POINTS} or more")
@@ -79,7 +79,7 @@ def validate_cloud(cloud: npt.ArrayLike) -> Points:
 
 
 def check_stamp(stamp: float, newest: float | None = None) -> None:
-    """Refuse a stamp that is no finite number of seconds, or not after that of the previous frame (RunError)."""
+    """Refuse a stamp that is not a finite number of seconds, or not after that of the previous frame (RunError)."""
     if isinstance(stamp, bool | np.bool_) or not isinstance(stamp, numbers.Real):
         raise RunError(f"stamp {stamp!r} is not numeric; give seconds, as a float")
     if not np.isfinite(stamp):
@@ -103,7 +103,7 @@ def check_rigid(T: npt.ArrayLike, name: str, error: type[InputError] = InputErro
 
 
 def validate_odometry(T_odom_body: npt.ArrayLike, stamp: float, newest: float | None = None) -> Pose:
-    """Return a frame's pose (4, 4), exactly rigid; RunError if it is no pose, or as :func:`check_stamp`."""
+    """Return a frame's pose (4, 4), exactly rigid; RunError if it is not a pose, or as :func:`check_stamp`."""
     check_stamp(stamp, newest)
     return check_rigid(T_odom_body, "T_odom_body", RunError)
 

@@ -158,7 +158,7 @@ class StepCheck:
     def add(self, T_odom_body: Pose, stamp: float) -> bool:
         """Add a frame's odometry (4, 4); return whether it has jumped.
 
-        The first step is no jump. After two jumps within ten steps such steps count as usual: frames lie far apart.
+        The first step is not a jump. After two jumps within ten steps such steps count as usual: frames lie far apart.
         """
         before, self._newest = self._newest, (T_odom_body, stamp)
         if before is None or stamp <= before[1]:

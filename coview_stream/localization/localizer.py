@@ -152,16 +152,21 @@ class Localizer(SavedState):
         Raises:
             CloudError: the cloud has another shape, fewer than 10 finite points, or lies kilometres off. RunError: the
                 pose is not rigid, or the stamp is not in seconds or not after the previous frame's. Neither changes the
-                localizer: count the frame, skip it and go on.
+                localizer: count the frame, skip it and go on. KeyboardInterrupt: half the frame is in, so the localizer
+                has begun to search anew (:meth:`relocalize`).
         """
-        frame, request = self._predict(cloud, T_odom_body, stamp)  # T_map_body = T_map_odom T_odom_body
-        if self.state.has_place:
-            match = self._match_to_map(frame)  # eq. 13, from the prediction; None where none is due
-            if match is not None:
-                self._update(match)  # verify, correct the graph of poses, change the state
-        elif request is not None:
-            self.apply_search_result(self.search.update(request))  # eqs 1-13, over the whole map
-        return self.fix()
+        try:
+            frame, request = self._predict(cloud, T_odom_body, stamp)  # T_map_body = T_map_odom T_odom_body
+            if self.state.has_place:
+                match = self._match_to_map(frame)  # eq. 13, from the prediction; None where none is due
+                if match is not None:
+                    self._update(match)  # verify, correct the graph of poses, change the state
+            elif request is not None:
+                self.apply_search_result(self.search.update(request))  # eqs 1-13, over the whole map
+            return self.fix()
+        except KeyboardInterrupt:
+            self.relocalize()
+            raise
 
     def add_frame(
         self, cloud: Reals, T_odom_body: Pose, stamp: float, defer: bool = False,

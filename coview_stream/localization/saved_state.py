@@ -84,7 +84,7 @@ def _read(path: Path) -> tuple[Pose | None, Calibration | None]:
         pose = None if document["T_map_body"] is None else read_pose(document, "T_map_body")
         return pose, read_calibration(document["calibration"])
     except (ValueError, TypeError, KeyError, OverflowError, RecursionError, OSError) as error:
-        raise InputError(f"{path}: is no state to be used ({error}); delete it to begin without") from error
+        raise InputError(f"{path}: holds no state that can be used ({error}); delete it to begin without") from error
 
 
 def read_document(data: bytes, form: str, version: int) -> dict[str, Any]:

@@ -56,7 +56,7 @@ def wire_entries(payload: bytes | memoryview, limit: int) -> list[Entry]:
         elif kind in _FIXED:
             position += _FIXED[kind]
         else:
-            raise MessageError("the payload is no protobuf message")
+            raise MessageError("the payload is not a protobuf message")
         if position > len(payload) or tag < 8:
             raise MessageError("the protobuf message is truncated or malformed")
         fields.append(Entry(tag >> 3, kind == _LENGTH, start, value, position))
@@ -141,7 +141,7 @@ def read_cloud(payload: bytes | memoryview) -> CloudMessage:
     fields = tuple((f.name, _KINDS[f.type], f.offset) for f in cloud.fields if f.type in _KINDS)
     step = cloud.point_stride
     if step == 0 or len(data) % step:
-        raise MessageError(f"{len(data)} bytes of points are no whole number of rows of {step} bytes")
+        raise MessageError(f"{len(data)} bytes of points are not a whole number of rows of {step} bytes")
     message = read_table(Table(data, fields, step, len(data) // step), _stamp(cloud))
     if not cloud.HasField("pose") or not cloud.pose.ByteSize():
         return message

@@ -84,7 +84,7 @@ def read_status(sample: Sample) -> dict[str, Any]:
     try:
         return read_object(sample.payload, _MAX_STATUS_BYTES)
     except MessageError as error:
-        raise MessageError(f"{sample.key}: the status is no JSON object ({error})") from error
+        raise MessageError(f"{sample.key}: the status is not a JSON object ({error})") from error
 
 
 def encode_hypotheses(message: HypothesesMessage) -> Encoded:
@@ -148,7 +148,7 @@ def read_object(payload: bytes, limit: int = _MAX_BYTES) -> dict[str, Any]:
     except (ValueError, RecursionError) as error:
         raise MessageError(f"no JSON: {str(error)[:80]}") from error
     if not isinstance(fields, dict):
-        raise MessageError("the JSON is no object with fields")
+        raise MessageError("the JSON is not an object with fields")
     return fields
 
 
@@ -210,7 +210,7 @@ def _protection(value: object) -> ProtectionLevel | None:
 
 
 def _refuse_constant(name: str) -> NoReturn:
-    raise MessageError(f"{name} is no JSON number")
+    raise MessageError(f"{name} is not a JSON number")
 
 
 def _unique(pairs: list[tuple[str, Any]]) -> dict[str, Any]:

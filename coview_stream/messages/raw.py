@@ -26,7 +26,7 @@ def _decode(sample: Sample, columns: int) -> CloudMessage:
         raise MessageError("no stamp: a raw layout needs an attachment of 8 bytes, int64 little-endian nanoseconds")
     row = 4 * columns
     if len(sample.payload) % row:
-        raise MessageError(f"{len(sample.payload)} bytes are no whole number of {row}-byte rows")
+        raise MessageError(f"{len(sample.payload)} bytes are not a whole number of {row}-byte rows")
     return read_table(Table(sample.payload, _XYZ, row, len(sample.payload) // row), stamp_ns)
 
 

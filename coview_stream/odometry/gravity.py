@@ -116,7 +116,7 @@ def wall_evidence(points: Reals, up: Floats, sigma: float) -> tuple[Floats, Floa
     normals = _patches(points[:: 1 + len(points) // _WALL_POINTS].astype(np.float64), up)
     better, walls = up, np.zeros((3, 3))
     for _ in range(_WALL_ROUNDS):
-        weights = 1.0 / (_WALL_SIGMA**2 + (normals @ better) ** 2)  # Cauchy's, as a car's door is no wall
+        weights = 1.0 / (_WALL_SIGMA**2 + (normals @ better) ** 2)  # Cauchy's, as a car's door is not a wall
         walls = (normals.T * weights) @ normals
         better = np.linalg.solve(walls + np.eye(3) / sigma**2, up / sigma**2)
         better /= np.linalg.norm(better)

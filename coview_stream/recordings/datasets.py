@@ -171,12 +171,12 @@ def _kitti_calibration(path: Path) -> tuple[Pose, tuple[str, ...]]:
             try:
                 values[name] = np.array([float(word) for word in numbers.split()])
             except ValueError as error:
-                raise RunError(f"{file}: {name} is no list of numbers; restore the file") from error
+                raise RunError(f"{file}: {name} is not a list of numbers; restore the file") from error
     if {name: value.size for name, value in values.items()} != {"R": 9, "T": 3}:
         raise RunError(f"{file}: has no R of nine and T of three numbers; restore the file")
     R = values["R"].reshape(3, 3)
     if not np.isfinite(R).all() or np.abs(R @ R.T - np.eye(3)).max() > _MAX_SKEW:
-        raise RunError(f"{file}: R is no rotation; restore the file")
+        raise RunError(f"{file}: R is not a rotation; restore the file")
     return pose_from(R, values["T"]), ()
 
 

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import re
 from dataclasses import dataclass
+from decimal import Decimal
 from itertools import pairwise
 from pathlib import Path
 
@@ -24,6 +26,7 @@ _FOLDERS = {
     "Scans": ("odom_poses.txt", "optimized_poses.txt"),  # saved by SC-LIO-SAM and SC-A-LOAM
 }
 """Folders of frames, and odometry files next to them; the first existing file counts."""
+_NUMBERS = re.compile(r"(\d+(?:\.\d+)?)")  # in a frame's name: numbers and stamps
 _MULRAN_SWEEPS = ("sensor_data/Ouster", "Ouster")
 _LAYOUTS = (
     "frames/NNNNNN.pcd (ply, bin, npy, las, laz) beside odometry.tum, KITTI's velodyne/*.bin with times.txt and "
@@ -75,7 +78,7 @@ def find_layout(path: Path) -> Layout:
         )
     for within in sorted(path.iterdir()):
         if _has_frames(within):
-            raise RunError(f"{path}: is no run; did you mean {within}?")
+            raise RunError(f"{path}: is not a run; did you mean {within}?")
     if any(is_cloud_name(file) for file in path.iterdir()):
         raise RunError(f"{path}: clouds lie in the directory itself; a run has {_LAYOUTS}")
     if (path / "manifest.json").exists():  # a site's
@@ -124,20 +127,22 @@ def find_bag(path: Path) -> Path | None:
 
 
 def _frames(folder: Path) -> tuple[Path, ...]:
-    """List a folder's cloud files by number, or by name if one has no number; RunError for none, twins or non-files."""
+    """List a folder's cloud files by the numbers in their names; RunError for none, twins, strangers or non-files."""
     files = [file for file in folder.iterdir() if is_cloud_name(file)]
     if not files:
         raise RunError(f"{folder}: no frames ({', '.join(sorted(CLOUD_SUFFIXES))}); put one cloud per scan there")
     for file in files:
         if not file.is_file():
-            raise RunError(f"{file}: is no file (a directory or a broken link); put the cloud itself there")
-    if all(file.stem.isdecimal() for file in files):
-        files.sort(key=lambda file: int(file.stem))
-        for before, after in pairwise(files):
-            if int(before.stem) == int(after.stem):
-                raise RunError(f"{folder}: {before.name} and {after.name} are the same frame; remove one")
-    else:
-        files.sort(key=lambda file: file.name)
+            raise RunError(f"{file}: is not a file (a directory or a broken link); put the cloud itself there")
+    numbered = [file for file in files if file.stem.isdecimal()]
+    if numbered and (others := sorted(set(files) - set(numbered))):
+        raise RunError(f"{others[0]}: has no number, unlike {min(numbered).name}; rename it or move it away")
+    files.sort(
+        key=lambda file: [Decimal(part) if at % 2 else part for at, part in enumerate(_NUMBERS.split(file.stem))]
+    )
+    for before, after in pairwise(files if numbered else ()):
+        if int(before.stem) == int(after.stem):
+            raise RunError(f"{folder}: {before.name} and {after.name} are the same frame; remove one")
     return tuple(files)
 
 
@@ -200,7 +205,7 @@ def _calibration(path: Path) -> Pose | None:
                 T = np.eye(4)
                 T[:3] = np.array([float(word) for word in rest.split()]).reshape(3, 4)
                 if not np.isfinite(T).all() or abs(np.linalg.det(T) - 1.0) > 0.1:
-                    raise RunError(f"{path}:{number}: Tr is no rigid transform; restore the file")
+                    raise RunError(f"{path}:{number}: Tr is not a rigid transform; restore the file")
                 return T
     except (ValueError, OSError) as error:
         if isinstance(error, RunError):

@@ -43,7 +43,7 @@ def open_lidar_run(
         raise RunError(f"{path}: --odometry kiss-icp and --odometry-topic {odometry_topic}; give one of them")
     bag = find_bag(path)
     if bag is None and cloud_topic is not None and path.exists():
-        raise RunError(f"{path}: is no ROS recording and has no topics; leave --cloud-topic out")
+        raise RunError(f"{path}: is not a ROS recording and has no topics; leave --cloud-topic out")
     if bag is not None:
         return _of_bag(bag, lidar, cloud_topic, progress, mount)
     layout = find_layout(path)
@@ -108,7 +108,7 @@ def _place_all(
     if failed:
         notes.append(f"{path}: lidar odometry could not place {len(failed)} of {count} frames; first: {failed[0]}")
     if lidar.restarts:
-        notes.append(f"{path}: lidar odometry began anew {lidar.restarts} times; what was driven there is missing")
+        notes.append(f"{path}: lidar odometry began anew {lidar.restarts} times; poses of that stretch are missing")
     return placed, np.array(poses), notes
 
 

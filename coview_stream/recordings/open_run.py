@@ -6,6 +6,8 @@ import os
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+import numpy as np
+
 from coview_stream.config.mount import Mount
 from coview_stream.errors import RunError
 from coview_stream.recordings.datasets import is_kitti_raw, open_kitti_raw, open_mulran
@@ -19,6 +21,7 @@ if TYPE_CHECKING:
 
 KISS_ICP = "kiss-icp"
 """Instead of an odometry file: compute odometry from the clouds."""
+_MILLISECONDS = 10.0  # between frames: 10 ms, the least of lidars, if it is taken for seconds
 
 
 def open_run(
@@ -67,7 +70,9 @@ def open_run(
 
         return open_bag(bag, explicit, cloud_topic, odometry_topic, mount=mount)
     if path.exists() and (cloud_topic is not None or odometry_topic is not None):
-        raise RunError(f"{path}: is no ROS recording and has no topics; leave --cloud-topic and --odometry-topic out")
+        raise RunError(
+            f"{path}: is not a ROS recording and has no topics; leave --cloud-topic and --odometry-topic out"
+        )
     if explicit is None and (sweeps := find_sweeps(path)) is not None:
         return open_mulran(path, sweeps, mount)
     if explicit is None and is_kitti_raw(path):
@@ -82,4 +87,6 @@ def open_run(
             "(t x y z qx qy qz qw per frame) or name a file, or make it of the clouds: --odometry kiss-icp"
         )
     stamps, poses = read_odometry(layout, explicit)
-    return Run(path, layout.frames, stamps, poses, mount=mount)
+    apart = float(np.median(np.diff(stamps))) if count > 1 else 0.0
+    notes = (f"{path}: frames are {apart:.4g} s apart; stamps have to be in seconds",) * (apart >= _MILLISECONDS)
+    return Run(path, layout.frames, stamps, poses, notes=notes, mount=mount)

@@ -18,7 +18,7 @@ from coview_stream.errors import ConfigError, InputError, counted
 from coview_stream.geometry.arrays import Floats
 from coview_stream.geometry.transforms import Poses, pose_to_tum
 
-_LATEST = 4e9  # seconds since 1970: later stamps, or stamps within the first year, are no Unix times
+_LATEST = 4e9  # seconds since 1970: later stamps, or stamps within the first year, are not Unix times
 _EARLIEST = 3.2e7
 
 

@@ -81,7 +81,7 @@ class SimulationConfig:
             height=(0.3, 5.0),
         )
         if len(self.origin) != 3 or not all(abs(value) <= 1e7 for value in self.origin):
-            raise ConfigError(f"origin: {self.origin!r} is no offset; give x y z in metres, up to 10,000 km")
+            raise ConfigError(f"origin: {self.origin!r} is not an offset; give x y z in metres, up to 10,000 km")
 
     def to_dict(self) -> dict[str, Any]:
         """Return all fields as plain values, for JSON; ``dirt``, ``drive_seed`` and ``mount`` only if set."""

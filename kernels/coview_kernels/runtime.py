@@ -251,7 +251,7 @@ def cores() -> int:
 
 
 def workers() -> int:
-    """Return the number of threads of a kernel; ValueError if ``COVIEW_THREADS`` is no positive whole number."""
+    """Return the number of threads of a kernel; ValueError if ``COVIEW_THREADS`` is not a positive whole number."""
     asked = os.environ.get("COVIEW_THREADS", "")
     if not asked:
         return min(_MAX_WORKERS, cores())
@@ -306,7 +306,7 @@ def backend() -> str:
     """Return the backend that runs, ``taichi``, ``quadrants`` or ``numpy``; start it if need be.
 
     Raises:
-        ValueError: ``COVIEW_KERNELS`` names no backend, or ``COVIEW_THREADS`` is no positive whole number.
+        ValueError: ``COVIEW_KERNELS`` names no backend, or ``COVIEW_THREADS`` is not a positive whole number.
         ImportError: ``COVIEW_KERNELS`` names a backend that is missing, or that the host program uses.
     """
     global _owner, _backend

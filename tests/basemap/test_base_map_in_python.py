@@ -67,7 +67,7 @@ def test_array_that_is_no_cloud_is_refused(given, says):
 
 
 def test_system_that_is_not_of_metres_is_refused(cut):
-    with pytest.raises(ConfigError, match="is no reference system; give EPSG:code, WKT, feet or us-feet"):
+    with pytest.raises(ConfigError, match="is not a reference system; give EPSG:code, WKT, feet or us-feet"):
         BaseMap.build(cut, crs="nonsense")
     with pytest.raises(ConfigError, match="crs 'EPSG:4326' is in degrees"):
         BaseMap.build(cut, crs="EPSG:4326")

@@ -110,7 +110,7 @@ def test_missing_output_directory_is_refused_before_building(tmp_path, refused):
     (tmp_path / "mine").mkdir()
     (tmp_path / "mine" / "thesis.txt").write_text("years of work")
     for cloud in ("none.las", "mine/thesis.txt"):
-        assert "mine: is no site, and not empty" in refused("build", tmp_path / cloud, "-o", tmp_path / "mine")
+        assert "mine: is not a site, and not empty" in refused("build", tmp_path / cloud, "-o", tmp_path / "mine")
 
 
 @pytest.mark.slow
@@ -229,4 +229,4 @@ def test_cloud_on_stdin_is_read_by_its_first_bytes(map_points, tmp_path, capsys,
     assert main(["build", "-", "-o", str(tmp_path / "site.coview"), "--radius", "20", "--no-learned"]) == 0
     assert f"{len(near)} points read" in capsys.readouterr().out
     stdin(b"PK\x03\x04\0\0")
-    assert "stdin is no cloud" in refused("build", "-", "-o", tmp_path / "x.coview")
+    assert "stdin is not a cloud" in refused("build", "-", "-o", tmp_path / "x.coview")

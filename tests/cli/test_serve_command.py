@@ -131,4 +131,4 @@ def test_max_payload_reaches_the_transport(monkeypatch, world_file):
 
 def test_metrics_without_an_address_does_not_swallow_the_map(world_file, refused):
     said = refused("serve", "--robot", "r1", "--metrics", world_file)
-    assert "is no HOST:PORT; write --metrics=127.0.0.1:9464" in said
+    assert "is not HOST:PORT; write --metrics=127.0.0.1:9464" in said

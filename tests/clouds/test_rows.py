@@ -52,7 +52,7 @@ def test_many_lines_are_read_piece_by_piece(tmp_path):
     [
         ("a.xyz", "1,5 2,5 3,5\n", r"a\.xyz:1: .*decimal commas"),
         ("a.xyz", "1 2\n3 4\n", r"a\.xyz:1: .*2 columns"),
-        ("a.xyz", lines(POINTS[:50]) + "1 2 none\n" + lines(POINTS[:5]), r"a\.xyz:51: '1 2 none' is no point"),
+        ("a.xyz", lines(POINTS[:50]) + "1 2 none\n" + lines(POINTS[:5]), r"a\.xyz:51: '1 2 none' is not a point"),
         ("a.csv", "a,b,c\n" * 200, "no point in the first 100 lines"),
         ("a.txt", "# only a comment\n", "no point"),
         ("a.xyz", "1" * 10_000, "a line of 10000 characters"),

@@ -63,7 +63,7 @@ BAD += [
 
 @pytest.mark.parametrize(("kind", "name", "value"), BAD)
 def test_value_out_of_range_or_of_another_type_is_refused_by_name(kind, name, value):
-    """What is no number must not end in a TypeError, nor a text in a flag count as true."""
+    """What is not a number must not end in a TypeError, nor a text in a flag count as true."""
     with pytest.raises(ConfigError, match=rf"^{name} is .*must be .*{kind.__name__}\.{name}"):
         kind(**{name: value})
 

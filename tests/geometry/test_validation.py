@@ -53,7 +53,7 @@ MOVED = np.array([[1.0, 0, 0, 5], [0, 1, 0, 6], [0, 0, 1, 7], [0, 0, 0, 1]])
     ],
 )
 def test_invalid_pose_is_refused_by_name_and_flaw(bad, flaw):
-    with pytest.raises(InputError, match=f"T_here is no rigid transform: .*{flaw}"):
+    with pytest.raises(InputError, match=f"T_here is not a rigid transform: .*{flaw}"):
         check_rigid(bad, "T_here")
 
 

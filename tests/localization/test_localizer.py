@@ -130,6 +130,21 @@ def test_reset_and_relocalize_search_again_and_find(world_map, world_drive, worl
     assert_pose(again[-1].T_map_body, world_drive.T_map_body[5], 0.08, 0.3)
 
 
+def test_interrupted_step_leaves_no_half_of_a_frame(world_map, world_drive, world_fixes):
+    class Interrupted(Localizer):
+        def apply_search_result(self, result):
+            super().apply_search_result(result)
+            raise KeyboardInterrupt
+
+    localizer = Interrupted(world_map)
+    with pytest.raises(KeyboardInterrupt):
+        follow(localizer, world_drive, 6)
+    with pytest.raises(RuntimeError, match="no frame yet"):
+        localizer.fix()
+    localizer.__class__ = Localizer
+    assert_usual(follow(localizer, world_drive, 6), world_fixes[:6], 0.02)
+
+
 @pytest.fixture(scope="module")
 def results(world_map, world_drive):
     """Results of the drive's searches, up to the one that accepts a place; good for every fresh localizer."""

@@ -86,7 +86,7 @@ def test_generic_encodings_fall_back_to_key_hint_and_magic(mute):
     assert cloud_codec(b"?", mute, NATIVE, hint="xyz") == "xyz"
     assert cloud_codec(b"\0\0\0\0", mute) == "cdr"
     assert odometry_codec(b'{"stamp_ns":1}', mute) == "json"
-    for payload in (b"\1\2\3\4", b"{}"):  # JSON is no cloud
+    for payload in (b"\1\2\3\4", b"{}"):  # JSON is not a cloud
         with pytest.raises(EncodingError, match=r"no encoding is set|json .*cannot carry"):
             cloud_codec(payload, mute)
 

@@ -6,6 +6,7 @@ import pytest
 from coview_stream.clouds import read_tum, write_cloud, write_tum
 from coview_stream.errors import CloudError, InputError, RunError
 from coview_stream.geometry.transforms import inverse, pose_from, rot_z
+from coview_stream.recordings.layouts import find_layout
 from coview_stream.recordings.open_run import open_run
 
 POINTS = np.random.default_rng(3).normal(0, 20, (30, 3)).astype(np.float32)
@@ -151,7 +152,7 @@ def test_odometry_not_matching_the_frames_is_refused(run, lines, reason):
 
 def test_binary_odometry_file_is_refused(run):
     (run / "odometry.tum").write_bytes(bytes(range(256)))
-    with pytest.raises(RunError, match="is no text"):
+    with pytest.raises(RunError, match="is not text"):
         open_run(run)
 
 
@@ -192,6 +193,24 @@ def test_duplicate_frames_and_broken_links_are_refused(run):
     (run / "frames" / "000004.pcd").symlink_to(run / "gone")
     with pytest.raises(RunError, match="broken link"):
         open_run(run)
+
+
+def test_stamps_in_milliseconds_are_noted(run):
+    assert open_run(run).notes == ()
+    write_tum(run / "odometry.tum", 1000.0 * (STAMPS - STAMPS[0]), POSES)
+    assert open_run(run).notes == (f"{run}: frames are 100 s apart; stamps have to be in seconds",)
+
+
+def test_frames_are_ordered_by_the_numbers_in_their_names(run):
+    """So that frame 10 does not follow frame 1; a copy without a number would shift all poses behind it."""
+    names = {"000000": "scan_9.5", "000001": "scan_9.25", "000002": "scan_10", "000003": "scan_100"}
+    for path in (run / "frames").iterdir():
+        path.rename(path.with_stem(names.get(path.stem, path.stem)))
+    frames = find_layout(run).frames
+    assert [path.stem for path in frames] == ["scan_9.25", "scan_9.5", "scan_10", "scan_100"]
+    frames[0].rename(frames[0].with_stem("7"))
+    with pytest.raises(RunError, match=r"scan_10\.pcd: has no number, unlike 7\.pcd"):
+        find_layout(run)
 
 
 def test_tum_trajectory_round_trip_normalizes_quaternions(tmp_path):

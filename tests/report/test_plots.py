@@ -27,7 +27,7 @@ def base():
 
 
 def pixels(path):
-    """The picture as (height, width, RGBA) in 0..1; fails if it is no PNG."""
+    """The picture as (height, width, RGBA) in 0..1; fails if it is not a PNG."""
     from matplotlib import image
 
     assert path.read_bytes().startswith(b"\x89PNG")

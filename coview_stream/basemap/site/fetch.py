@@ -204,7 +204,7 @@ class Mirror:
             ):
                 raise
             self.offline = str(error)
-            warn(f"{error}; going on with what was fetched before, manifest {cached.sha256[:12]}")
+            warn(f"{error}; going on with the tiles fetched before, manifest {cached.sha256[:12]}")
         return self.map_path
 
     def _wanted(self, manifest: Manifest) -> dict[str, tuple[LayerEntry, TileEntry]]:

@@ -110,7 +110,7 @@ def decode(raw: bytes, name: str, most: int = _MAX_BYTES) -> dict[str, npt.NDArr
             raise ValueError("something follows its end")
         return arrays
     except (ValueError, TypeError, KeyError, OverflowError, RecursionError, OSError, EOFError, lzma.LZMAError) as error:
-        raise MapError(f"{name}: is no layer of a tile ({error}); fetch or build it again") from error
+        raise MapError(f"{name}: is not a layer of a tile ({error}); fetch or build it again") from error
 
 
 def _unpacked(part: bytes, packing: object, wanted: int, itemsize: int) -> npt.NDArray[np.uint8]:

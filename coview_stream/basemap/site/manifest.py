@@ -179,8 +179,8 @@ class Manifest:
     def from_bytes(cls, raw: bytes, name: str, key: VerifyKey | None = None) -> Manifest:
         """Read untrusted bytes of :meth:`to_bytes`, or of earlier versions, which were indented.
 
-        Checks the signature first if there is a key. MapError if it is wrong or missing, if the bytes are no manifest,
-        or if their version is unknown.
+        Checks the signature first if there is a key. MapError if that is wrong or missing, if the bytes hold no
+        manifest, or if their version is unknown.
         """
         try:
             if len(raw) > MAX_MANIFEST:
@@ -204,7 +204,7 @@ class Manifest:
                 raise MapError(f"{name}: is of version {str(data['version'])[:20]}, this program reads {VERSION} and 1")
             origin = tuple(_number(value) for value in data["origin"])
             if len(origin) != 3:
-                raise ValueError("origin is no list of three numbers")
+                raise ValueError("origin is not a list of three numbers")
             tile, crs, parameters = _number(data["tile"]), data["crs"], data["parameters"]
             if not 1.0 <= tile <= 10_000.0 or not isinstance(crs, str | None) or not isinstance(parameters, dict):
                 raise ValueError("tile, crs or parameters are invalid")
@@ -258,7 +258,7 @@ def read_manifest(directory: Path, name: str = FILE) -> bytes:
             return file.read(MAX_MANIFEST + 1)
     except OSError as error:
         raise MapError(
-            f"{directory}: is no site, {name} cannot be read ({error.strerror}); give a .coview file, or a "
+            f"{directory}: is not a site, {name} cannot be read ({error.strerror}); give a .coview file, or a "
             "directory that 'build -o DIRECTORY/' made"
         ) from error
 
@@ -286,7 +286,7 @@ def _refuse_other(content: bytes, name: str) -> NoReturn:
     """Raise the MapError for bytes that list no tiles."""
     if f'"format": "{FORMAT}"'.encode() in content[:_MAX_HEAD]:
         raise ValueError("it lists no tiles as 'build' writes them")
-    raise MapError(f"{name}: is no manifest of a site; name the directory that 'build -o DIRECTORY/' made")
+    raise MapError(f"{name}: is not a manifest of a site; name the directory that 'build -o DIRECTORY/' made")
 
 
 def _check_signature(content: bytes, signature: bytes, signer: bytes, key: VerifyKey, name: str) -> None:
@@ -329,14 +329,14 @@ def in_order(tiles: Iterable[TileEntry]) -> tuple[TileEntry, ...]:
 
 def _whole(value: Any, limit: int, signed: bool = False) -> int:
     if type(value) is not int or not (-limit if signed else 0) <= value <= limit:
-        raise ValueError(f"{str(value)[:40]} is no whole number up to {limit}")
+        raise ValueError(f"{str(value)[:40]} is not a whole number up to {limit}")
     return value
 
 
 def _finite(text: str) -> float:
     value = float(text)
     if not math.isfinite(value):
-        raise ValueError(f"{text[:40]} is no finite number")
+        raise ValueError(f"{text[:40]} is not a finite number")
     return value
 
 
@@ -349,5 +349,5 @@ def _check_depth(value: object, left: int) -> None:
 
 def _number(value: Any) -> float:
     if type(value) not in (int, float) or not math.isfinite(value) or abs(value) > _MAX_METRES:
-        raise ValueError(f"{str(value)[:40]} is no length")
+        raise ValueError(f"{str(value)[:40]} is not a length")
     return float(value)

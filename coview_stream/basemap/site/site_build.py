@@ -97,7 +97,7 @@ def build_site(
         key: signs the manifest.
         executor: runs the steps; None runs them in this process.
         keep_going: skip sources and tiles that fail, instead of raising.
-        progress: show a bar on stderr, or one line per stage where stderr is no terminal.
+        progress: show a bar on stderr, or one line per stage where stderr is not a terminal.
 
     Raises:
         CloudError: a source cannot be read. MapError: there are no stations, or the directory cannot be used.
@@ -170,7 +170,7 @@ def check_directory(directory: Path) -> None:
     if not directory.is_dir() or is_site(directory) or (directory / WORK).is_dir():
         return
     if any(directory.iterdir()):
-        raise MapError(f"{directory}: is no site, and not empty; name a new directory")
+        raise MapError(f"{directory}: is not a site, and not empty; name a new directory")
 
 
 def _extent(sources: dict[str, Source], run: _Run) -> tuple[dict[str, Source], Floats, Floats]:

@@ -33,9 +33,9 @@ _MARK = ".checked"  # suffix of the record of a file that has been compared with
 
 
 def layer_path(sha256: str) -> str:
-    """Return the path of a layer relative to its site's directory; MapError if ``sha256`` is no hash."""
+    """Return the path of a layer relative to its site's directory; MapError if ``sha256`` is not a hash."""
     if not SHA256.fullmatch(sha256):
-        raise MapError(f"{sha256[:80]!r} is no sha256 of a layer")
+        raise MapError(f"{sha256[:80]!r} is not a sha256 of a layer")
     return f"{_FOLDER}/{sha256[:2]}/{sha256}"
 
 
@@ -50,7 +50,7 @@ class TileStore:
         self.folder = directory / _FOLDER
 
     def path(self, sha256: str) -> Path:
-        """Return the file of a layer, which need not exist; MapError if ``sha256`` is no hash."""
+        """Return the file of a layer, which need not exist; MapError if ``sha256`` is not a hash."""
         return self.folder.parent / layer_path(sha256)
 
     def put(self, content: bytes) -> str:
@@ -154,14 +154,14 @@ def read_record(path: Path) -> Any:
 
 
 def cache_bound() -> float:
-    """Return the bytes that the cache may hold; ConfigError if ``$COVIEW_CACHE_GB`` is no size."""
+    """Return the bytes that the cache may hold; ConfigError if ``$COVIEW_CACHE_GB`` is not a size."""
     text = os.environ.get("COVIEW_CACHE_GB", "20")
     try:
         bound = float(text)
     except ValueError:
         bound = -1.0
     if not bound > 0:
-        raise ConfigError(f"COVIEW_CACHE_GB={text}: is no size in GB")
+        raise ConfigError(f"COVIEW_CACHE_GB={text}: is not a size in GB")
     return bound * 1e9
 
 

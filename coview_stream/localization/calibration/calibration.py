@@ -232,7 +232,7 @@ class Calibration:
             side, how = ("above", "filled, piled up") if self.changed > 0 else ("below", "dug")
             clauses.append(
                 f"the ground here lies {abs(self.changed):.1f} m {side} the survey's ({how}): "
-                "heights follow odometry and what stands around"
+                "heights follow odometry and structure around"
             )
         return clauses
 

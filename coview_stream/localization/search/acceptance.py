@@ -119,7 +119,7 @@ def _verdict(scored: Scored, leader: Hypothesis | None, rule: AcceptanceConfig, 
     if scored.moved.probability > scored.error:  # most of the error
         metres = f"{scored.moved.metres:.0f} m"
         wrong = f"wrong {one_in(scored.error)}, {one_in(rule.risk)} needed"
-        return State.AMBIGUOUS, f"a part of what is seen may fit {metres} beside the rest: {wrong}"
+        return State.AMBIGUOUS, f"a part of the scan may fit {metres} beside the rest: {wrong}"
     if scored.none > 0.5:
         if scored.by_chance < 1.5:
             return State.SEARCHING, "no place stands out: the best fits no better than chance would have it"

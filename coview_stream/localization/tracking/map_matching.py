@@ -236,7 +236,7 @@ class MapMatcher:
                 match = min(verified, key=lambda other: off_by(right, other.T_map_body)[0], default=match)
                 moves = not matters(*off_by(right, match.T_map_body))
                 metres, degrees = off_by(match.T_map_body, T_map_predicted)
-        reason = f"odometry is {metres:.2f} m and {degrees:.1f} degrees off what the lidar sees"
+        reason = f"odometry is {metres:.2f} m and {degrees:.1f} degrees off the lidar's motion"
         if not moves:
             reason += ", and the scan fits there hardly better than elsewhere: something may have been moved"
         verdict = replace(match.verdict, cause=RejectionReason.ODOMETRY, reason=reason)
@@ -266,7 +266,7 @@ class MapMatcher:
         if observation.against_elsewhere > 0.0:
             return RejectionReason.VERIFIED, "verified"
         if observation.ratio > 0.0:
-            return RejectionReason.FITNESS, "what is seen fits as well metres beside"
+            return RejectionReason.FITNESS, "the scan fits as well some metres beside"
         return self.baseline.explain(evidence)
 
 

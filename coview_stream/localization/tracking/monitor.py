@@ -130,14 +130,14 @@ class EvidenceBaseline:
         inside = evidence.inside / (usual.inside or 1.0)
         worst = min(structure, ground, space, inside)
         if worst >= 1.0 and evidence.inside >= _OFF_MAP:
-            return RejectionReason.FITNESS, "what is seen fits no better here than by chance"
+            return RejectionReason.FITNESS, "the scan fits no better here than by chance"
         if worst == inside or evidence.inside < _OFF_MAP:
-            return RejectionReason.OFF_MAP, f"only {evidence.inside:.0%} of what is seen lies on the map"
+            return RejectionReason.OFF_MAP, f"only {evidence.inside:.0%} of the scan lies on the map"
         if worst == space:
             return RejectionReason.FREE_SPACE, f"rays pass through {1 - evidence.free_space:.0%} of the map's points"
         if worst == ground:
             return RejectionReason.GROUND, f"only {evidence.ground:.0%} of the ground lies on the map's"
-        here = f"{evidence.near:.0%} of what stands above the ground is on the map"
+        here = f"{evidence.near:.0%} of the points above the ground are on the map"
         return RejectionReason.FITNESS, f"{here}{f', {usual.near:.0%} usual here' if self.usual else ''}"
 
 
@@ -194,7 +194,7 @@ class LossMonitor:
         waited, driven = (0.0, 0.0) if self._newest is None else (stamp - self._newest[0], travelled - self._newest[1])
         self._newest = stamp, travelled
         prior = PER_METRE * max(driven, 0.0) + _PER_SECOND * max(waited, 0.0) * (self._since is not None)
-        # repeated fits of a standing robot are no certainty: at any view the place may have become wrong
+        # repeated fits of a standing robot do not make it certain: at any view the place may have become wrong
         self._before = max(self._before + prior, PER_METRE * self._tracking.distance)
         self._odds += prior
         if verdict.observation is not None:

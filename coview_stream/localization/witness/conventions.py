@@ -36,7 +36,7 @@ from coview_stream.geometry.transforms import (
 from coview_stream.odometry.gravity import ground_plane
 
 HEADING, SCALE = math.radians(8.0), 0.12
-"""Heading of the lidar on the body, radians, and error of odometry's scale that are no other convention."""
+"""Heading of the lidar on the body, radians, and error of odometry's scale that are not another convention."""
 SURE = math.log(99.0)
 """Log odds of a finding: agreement of two motions may be chance (1 in 48), that of three is not (1 in 340)."""
 STILL = 0.5  # metres; a robot that moves less is taken to stand
@@ -163,8 +163,8 @@ def unit_of(points: Points) -> float:
 def _log_odds(gap: float, far: float, farther: float, sigma: float) -> float:
     """Return the log odds that odometry follows the clouds by one motion, ``gap`` metres from it.
 
-    If it follows, the gap stays within the heading and scale that are no finding, over ``far`` metres; if not, odometry
-    is an unrelated motion of up to ``farther`` metres. The clouds' motion has ``sigma``, and sometimes fails.
+    If it follows, the gap stays within tolerable errors of heading and scale over ``far`` metres; if not, odometry is
+    an unrelated motion of up to ``farther`` metres. The clouds' motion has ``sigma``, and sometimes fails.
     """
     return _mixed(_gaussian(gap, math.hypot(math.hypot(HEADING, SCALE) * far, sigma), farther))
 

@@ -31,7 +31,7 @@ class StepStamps(NamedTuple):
     sigma: float  # of an interval about a multiple of the period, seconds
     usual: float  # interval, seconds
     holes: float  # share of intervals with a hole
-    jitter: float  # share of intervals that are no multiple
+    jitter: float  # share of intervals that are not a multiple
 
     def allow(self, longer: Floats, sigma: float = _BIN) -> Floats:
         """Return the likelihood (...) of the stamps if the lag grows by ``longer`` (...) seconds, against no change.

@@ -116,7 +116,7 @@ def load(folder: Path, robot: str, map_sha256: str) -> LastPlace | None:
     except OSError as error:
         log.warning("%s: the last pose cannot be read (%s); searching without", path, error.strerror or error)
     except (ValueError, TypeError, KeyError, OverflowError, RecursionError) as error:
-        log.warning("%s: is no last pose to be used (%s); searching without", path, error)
+        log.warning("%s: holds no last pose that can be used (%s); searching without", path, error)
     return None
 
 
@@ -164,7 +164,7 @@ def _open_regular(path: Path) -> BinaryIO:
     file = os.fdopen(os.open(path, flags), "rb")
     if not stat.S_ISREG(os.fstat(file.fileno()).st_mode):
         file.close()
-        raise OSError("it is no file")
+        raise OSError("it is not a file")
     return file
 
 
@@ -185,7 +185,7 @@ def guess_of_fields(given: Mapping[str, Any]) -> PlaceGuess:
         )
     map_name = given.get("map") or None
     if not isinstance(map_name, str | None):
-        raise InputError(f"initial pose: map is {str(map_name)[:40]!r}, which is no name")
+        raise InputError(f"initial pose: map is {str(map_name)[:40]!r}, which is not a name")
     numbers: dict[str, float] = {}
     for name, value in given.items():
         if name == "map" or (value is None and name in ("yaw", "within")):
@@ -195,7 +195,7 @@ def guess_of_fields(given: Mapping[str, Any]) -> PlaceGuess:
                 raise TypeError("it is a truth value")
             numbers[name] = float(value)
         except (TypeError, ValueError) as error:
-            raise InputError(f"initial pose: {name} is {str(value)[:40]!r}, which is no number") from error
+            raise InputError(f"initial pose: {name} is {str(value)[:40]!r}, which is not a number") from error
     try:
         return PlaceGuess(**numbers, map=map_name)
     except ConfigError as error:

@@ -143,7 +143,7 @@ class RobotEndpoints:
         return self._answer()
 
     def suggest(self, parameters: dict[str, str]) -> dict[str, Any]:
-        """Answer ``rpc/suggest``; InputError, which is sent as the reply, if ``parameters`` are no guess."""
+        """Answer ``rpc/suggest``; InputError, which is sent as the reply, if ``parameters`` are not a guess."""
         guess, notes = guess_of_fields(parameters), []
         for session in self._sessions:
             try:

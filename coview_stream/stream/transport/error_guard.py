@@ -13,7 +13,7 @@ from coview_stream.errors import printable
 
 
 def is_panic(error: BaseException) -> bool:
-    """Whether a Rust library panicked: pyo3's PanicException is no Exception, and cannot be imported."""
+    """Whether a Rust library panicked: pyo3's PanicException is not an Exception, and cannot be imported."""
     return type(error).__name__ == "PanicException"
 
 

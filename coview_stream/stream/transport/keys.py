@@ -69,7 +69,7 @@ def check_expression(text: str, option: str, wildcards: bool = True) -> str:
         rest = "" if chunk in ("*", "**") else chunk.replace("$*", "")
         if _FORBIDDEN.search(rest) or chunk == "$*" or "$*$*" in chunk or not chunk.isprintable():
             raise ConfigError(
-                f"{option} {text!r}: {chunk!r} is no part of a zenoh key ('*' and '**' stand alone, '$*' within text)"
+                f"{option} {text!r}: {chunk!r} is not part of a zenoh key ('*' and '**' stand alone, '$*' within text)"
             )
     for first, second in pairwise(chunks):
         if first == "**" and second in ("*", "**"):
@@ -208,7 +208,7 @@ def robot_keys(
     pose_key = _filled(pose or row.pose, values, "--pose-key", wildcards=False)
     if row.rmw and not _RMW_KEY.fullmatch(pose_key):
         raise ConfigError(
-            f"--pose-key {pose_key!r} is no rmw_zenoh key: <domain>/<topic>/<type>/<hash>, such as {row.pose!r}"
+            f"--pose-key {pose_key!r} is not an rmw_zenoh key: <domain>/<topic>/<type>/<hash>, such as {row.pose!r}"
         )
     own = f"{base}/{robot}"
     return RobotKeys(

@@ -139,7 +139,7 @@ def compose(
     for key in _FILES:
         name = _get(config, key)
         if name is not None and not Path(name).is_file():  # zenoh would retry for ever without an error
-            raise TransportError(f"zenoh configuration {path}: {key} names {name}, which is no file")
+            raise TransportError(f"zenoh configuration {path}: {key} names {name}, which is not a file")
     return config
 
 

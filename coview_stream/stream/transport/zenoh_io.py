@@ -237,7 +237,9 @@ def _json_object(key: str, payload: bytes, max_bytes: int) -> dict[str, Any]:
     try:
         return read_object(payload, max_bytes)
     except MessageError as error:
-        raise TransportError(f"{key}: the answer is no JSON object ({error}); is this a coview_stream node?") from error
+        raise TransportError(
+            f"{key}: the answer is not a JSON object ({error}); is this a coview_stream node?"
+        ) from error
 
 
 def _error_of(payload: bytes) -> str:

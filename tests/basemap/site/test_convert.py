@@ -76,7 +76,7 @@ def test_light_copy_is_made_from_a_directory_to_another(site, tmp_path, capsys):
     (tmp_path / "one.coview").write_bytes(b"a map")
     for words, said in (
         ([tmp_path / "none.coview", tmp_path / "light", "--light"], "is not there"),
-        ([tmp_path / "one.coview", tmp_path / "light", "--light"], "is no directory of tiles"),
+        ([tmp_path / "one.coview", tmp_path / "light", "--light"], "is not a directory of tiles"),
         ([site, tmp_path / "light.coview", "--light"], "a directory of tiles is written"),
         ([site, f"{tmp_path}/copy/"], "name a file, NAME.coview, or add --light"),
     ):

@@ -165,7 +165,7 @@ def test_state_that_no_map_can_be_made_of_does_not_replace_the_one_that_was_open
         assert mirror.refresh()
     for file in mirror.directory.parent.parent.glob("*.coview"):
         file.unlink()  # as if evicted
-    with pytest.warns(CoViewWarning, match="is no layer of a tile .* going on with the map that was opened before"):
+    with pytest.warns(CoViewWarning, match="is not a layer of a tile .* going on with the map that was opened before"):
         base_map = BaseMap.load(mirror.map_path)
     assert (len(base_map), base_map.parameters["site"]) == (stations, good.sha256)
     mirror.source.gone = True

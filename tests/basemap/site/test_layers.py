@@ -56,7 +56,7 @@ def test_changed_bytes_are_refused_or_change_only_numbers(at, packing):
 
 @pytest.mark.parametrize("cut", [0, 7, 30, 200, -1])
 def test_cut_bytes_are_refused(cut, packing):
-    with pytest.raises(MapError, match="is no layer of a tile"):
+    with pytest.raises(MapError, match="is not a layer of a tile"):
         decode(encode(ARRAYS, packing)[:cut], "tile")
 
 
@@ -74,7 +74,7 @@ def test_unknown_packings_are_refused(other):
 @pytest.mark.parametrize("shape", [[1 << 30], [1 << 15, 1 << 15], [-1], [2.0], ["a"], [1, 1, 1, 1, 1]])
 def test_impossible_shapes_take_no_memory(shape):
     header = json.dumps([{"name": "a", "type": "f4", "shape": shape, "bytes": 0}]).encode()
-    with pytest.raises(MapError, match="is no layer of a tile"):
+    with pytest.raises(MapError, match="is not a layer of a tile"):
         decode(b"COVIEWL1" + len(header).to_bytes(4, "little") + header, "tile")
 
 

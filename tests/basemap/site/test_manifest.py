@@ -108,7 +108,7 @@ def test_manifest_of_many_tiles_is_read_tile_by_tile():
     third, fifth = (f'"area": 7, "column": {k},'.encode() for k in (3, 5))
     assert third in raw
     wrong = raw.replace(third, b'"area": -7, "column": 3,').replace(fifth, b"]")
-    with pytest.raises(MapError, match=r"-7 is no whole number"):  # checked before the text behind it is parsed
+    with pytest.raises(MapError, match=r"-7 is not a whole number"):  # checked before the text behind it is parsed
         Manifest.from_bytes(wrong, "site.json")
     for blanks, holds in ((1024, True), (2048, False)):  # the parser is given no more of a tile than 2 kB at once
         padded = raw.replace(third, third + b" " * blanks)
@@ -150,7 +150,7 @@ def test_store_gives_back_only_what_its_name_says(tmp_path):
         with pytest.raises(MapError, match=sha):
             store.get(sha, 5)
         assert not store.is_whole(sha, 5)
-    with pytest.raises(MapError, match="is no sha256"):
+    with pytest.raises(MapError, match="is not a sha256"):
         store.path("../x")
 
 

@@ -135,9 +135,9 @@ def test_tile_that_fails_is_named_and_left_out_if_that_is_wanted(halves, tmp_pat
 def test_directories_and_sources_that_no_site_can_be_built_of(halves, tmp_path):
     (tmp_path / "full").mkdir()
     (tmp_path / "full" / "mine.txt").write_text("x")
-    with pytest.raises(MapError, match=r"full: is no site, and not empty"):
+    with pytest.raises(MapError, match=r"full: is not a site, and not empty"):
         build_site(halves, tmp_path / "full", CONFIG)
-    with pytest.raises(MapError, match="is no site"):
+    with pytest.raises(MapError, match="is not a site"):
         BaseMap.load(tmp_path / "full")
     with pytest.raises(MapError, match="is a file"):
         build_site(halves, halves / "a.las", CONFIG)

@@ -83,7 +83,7 @@ def test_part_that_was_moved_counts_in_stated_errors_above_the_risk_as_well(neve
     sector = ((np.arctan2(cloud[:, 1], cloud[:, 0]) + np.pi) / (2.0 * np.pi) * 12.0).astype(int)
     cloud[(sector % 3 == 0) & (cloud[:, 2] > -1.0), 0] -= 4.0
     evidence = never_sure.update(next(run_of(replace(world_drive, clouds=[cloud]), 1))).evidence
-    assert evidence.reason.startswith("a part of what is seen may fit 4 m beside the rest")
+    assert evidence.reason.startswith("a part of the scan may fit 4 m beside the rest")
     assert 0.4 < evidence.confidence < 0.9  # either part may be the moved one
 
 

@@ -236,9 +236,9 @@ def used():
 @pytest.mark.parametrize(
     ("changes", "cause", "clause"),
     [
-        ({"inside": 0.25}, RejectionReason.OFF_MAP, "only 25% of what is seen lies on the map"),
+        ({"inside": 0.25}, RejectionReason.OFF_MAP, "only 25% of the scan lies on the map"),
         ({"ground": 0.4}, RejectionReason.GROUND, "only 40% of the ground lies on the map's"),
-        ({"near": 0.1, "covered": 0.2}, RejectionReason.FITNESS, "10% of what stands above the ground is on the map"),
+        ({"near": 0.1, "covered": 0.2}, RejectionReason.FITNESS, "10% of the points above the ground are on the map"),
         ({"free_space": 0.05}, RejectionReason.FREE_SPACE, "rays pass through 95% of the map's points"),
     ],
 )

@@ -133,7 +133,7 @@ def test_place_that_odometry_leads_beside_is_held_against_the_right_one(world_ma
         assert best.verdict.verified
         assert best is not tries[0]
         assert not tries[0].verdict.verified
-        assert tries[0].verdict.reason == "what is seen fits as well metres beside"
+        assert tries[0].verdict.reason == "the scan fits as well some metres beside"
         assert tries[0].verdict.observation.rival == pytest.approx(best.verdict.observation.ratio, abs=3.0)
 
 

@@ -171,7 +171,7 @@ def test_unknown_json_fields_are_passed_on():
 
 @pytest.mark.parametrize("payload", [b"", b"[]", b"3", b"{", b"\xff", b'{"a": NaN}', b"[" * 100_000])
 def test_status_that_is_not_json_is_refused(payload):
-    with pytest.raises(MessageError, match="the status is no JSON"):
+    with pytest.raises(MessageError, match="the status is not a JSON"):
         read_status(Sample("coview/r1/out/status", payload))
 
 
