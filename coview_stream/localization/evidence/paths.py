@@ -27,7 +27,8 @@ _SHIFTS: Floats = np.array([(x, y, 0.0, 0.0) for y in range(-2, 3) for x in rang
 """Shifts of a path, metres: the basin of a place."""
 _TURNS: Floats = np.radians(1.0) * np.array([[0.0, 0.0, 0.0, turn] for turn in (-1, 0, 1)])  # of a shifted path
 _DRIFT = 0.02, 0.05  # of odometry between keyframes, one sigma: share of the distance, and metres
-_SCATTER = 0.2  # metres of a pose about its path where few poses show it: cells are half a metre wide
+SCATTER = 0.2
+"""Metres of a pose about its path where few poses show it: cells are half a metre wide."""
 _WEIGHT = 4.0  # of that scatter, in degrees of freedom
 
 
@@ -120,7 +121,7 @@ def smoothed(offsets: Floats, bodies: Floats) -> Floats:
     linear = np.column_stack([np.ones(count), driven - driven.mean()])
     rest = (np.eye(count) - linear @ np.linalg.pinv(linear)) @ offsets[:, :, :2]
     free = 2.0 * max(count - 2, 0)
-    variance = (np.square(rest).sum(axis=(1, 2)) + _WEIGHT * _SCATTER**2) / (free + _WEIGHT)
+    variance = (np.square(rest).sum(axis=(1, 2)) + _WEIGHT * SCATTER**2) / (free + _WEIGHT)
     change = np.diff(np.eye(count), axis=0)
     walk = change.T @ (change / (np.square(_DRIFT[0] * steps) + _DRIFT[1] ** 2)[:, None])
     information = np.eye(count) / variance[:, None, None] + walk

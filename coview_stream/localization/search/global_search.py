@@ -23,7 +23,14 @@ from coview_stream.localization.search.lost_place import weighed_by_odometry
 from coview_stream.localization.search.places import BASIN_ANGLE, BASIN_DISTANCE, Scored
 from coview_stream.localization.search.recognizers import CoViewRecognizer, PlaceRecognizer, SearchIndex
 from coview_stream.localization.search.refinement import find_modes, levelled_by_frame, register_place
-from coview_stream.localization.search.request import EarlierKeyframe, Epoch, RequestSpec, SearchRequest, same_place
+from coview_stream.localization.search.request import (
+    EarlierKeyframe,
+    Epoch,
+    LostPlace,
+    RequestSpec,
+    SearchRequest,
+    same_place,
+)
 from coview_stream.localization.search.scoring import PlaceScorer
 
 _ORDINARY = 20_000  # stations up to which the configured number of co-view hypotheses is enough
@@ -121,6 +128,7 @@ class GlobalSearch:
         self._guesses = HintSchedule()
         self._scorer.clear()
         self._keyframes = 0
+        self._lost: LostPlace | None = None  # at the first keyframe
         self._named: list[tuple[Hypothesis, int]] = []  # places for the next keyframe, each with its rank in the votes
 
     def reset(self) -> None:
@@ -133,6 +141,8 @@ class GlobalSearch:
         """Search the map for one keyframe; another epoch or an acceptance starts a new search."""
         if request.epoch != self._epoch:
             self._begin(request)
+        if not self._scorer.scans:
+            self._lost = request.lost
         self._scorer.area = request.area
         self._vote(request)  # eqs 1-9: descriptors, compared with all stations at all turns
         voted, ranks = self._propose()  # eq. 12: peaks of the consensus as T_map_odom
@@ -164,7 +174,8 @@ class GlobalSearch:
         if leader is not None:
             scored = self._gathered(scored, leader, scan, request)
             scans = [scan] if reading.leans else [*self._scorer.scans[:-1], scan]
-            context = request, scans, self.base_map, self.config, reading.scorer
+            begin = self._lost if len(scans) > 1 else None
+            context = request, scans, self.base_map, self.config, reading.scorer, begin
             if weighed_by_odometry(scored, leader, *context).error < self.config.acceptance.risk:
                 place = scored.places[0]
                 modes = find_modes(
@@ -272,6 +283,7 @@ class GlobalSearch:
         keyframes = self._keyframes if request.earlier else 0
         self.clear()
         self._epoch, self._scorer.starts, self._keyframes = request.epoch, starts, keyframes
+        self._lost = request.lost
         self._scorer.go_on_with([self._observed(each) for each in request.earlier])
 
     def _observed(self, keyframe: SearchRequest | EarlierKeyframe) -> ObservedScan:

@@ -4,7 +4,8 @@ The robot is where odometry leads, within its drift, or odometry went wrong and 
 within the drift is confirmed. One beside it contradicts odometry. Then either the path is wrong, by the odds of
 :class:`LostPlace`. Or the robot is at the path's end, and the structure that fits at the first place has moved since
 the survey, or the scans fit at the end hardly less. After a loss among moved buildings, the evidence of the map alone
-puts a robot metres off its right path.
+puts a robot metres off its right path, from the first keyframe on. Odometry had hardly drifted there, so drift has to
+explain the distance at the first keyframe of the evidence, not at the newest.
 """
 
 from __future__ import annotations
@@ -16,15 +17,17 @@ import numpy as np
 
 from coview_stream.basemap.basemap import BaseMap
 from coview_stream.config import LocalizerConfig
+from coview_stream.geometry.arrays import Floats
 from coview_stream.geometry.distributions import chi2_quantile
 from coview_stream.geometry.protection import ALERT_DEGREES, ALERT_METRES
 from coview_stream.geometry.transforms import boxminus
 from coview_stream.localization.evidence.moved_part import FARTHEST_MOVED, log_odds_of_moved
 from coview_stream.localization.evidence.observation import ObservedScan
+from coview_stream.localization.evidence.paths import SCATTER
 from coview_stream.localization.registration.register import registration_covariance
 from coview_stream.localization.search.consensus import Hypothesis
 from coview_stream.localization.search.places import BASIN_ANGLE, BASIN_DISTANCE, Scored
-from coview_stream.localization.search.request import SearchRequest, same_place
+from coview_stream.localization.search.request import LostPlace, SearchRequest, same_place
 from coview_stream.localization.search.scoring import PlaceScorer
 
 _LEVEL = [3, 4, 5, 2]  # x, y, z and heading of (rx, ry, rz, x, y, z)
@@ -33,11 +36,12 @@ _HEIGHT = 0.5  # metres, sigma of the ground's height against the survey's: gras
 
 def weighed_by_odometry(
     scored: Scored, leader: Hypothesis, request: SearchRequest, scans: Sequence[ObservedScan], base_map: BaseMap,
-    config: LocalizerConfig, scorer: PlaceScorer,
+    config: LocalizerConfig, scorer: PlaceScorer, begin: LostPlace | None = None,
 ) -> Scored:  # fmt: skip
     """Return a keyframe's places, of which the first is registered as ``leader``, weighed by the request's lost place.
 
-    ``scans`` are the newest keyframes, newest last; their evidence is that of ``scorer``.
+    ``scans`` are the newest keyframes, newest last; their evidence is that of ``scorer``. ``begin`` is the lost place
+    at the scorer's first keyframe; None if that is the newest.
     """
     lost = request.lost
     if lost is None or leader.registration is None:
@@ -45,24 +49,46 @@ def weighed_by_odometry(
     body, end = request.T_odom_body, lost.T_map_odom @ request.T_odom_body
     at = [leader.T_map_odom, *(place.T_map_odom for place in scored.places[1:])]
     gaps = np.array([boxminus(end, T @ body) for T in at])
+    metres, radians = np.linalg.norm(gaps[:, 3:], axis=1), np.abs(gaps[:, 2])
     registered = registration_covariance(leader.registration.information, config.registration)
     spread = lost.covariance + registered + np.diag([0.0, 0.0, 0.0, 0.0, 0.0, _HEIGHT**2])
-    distance = np.einsum(
-        "ki,ki->k", gaps[:, _LEVEL], np.linalg.solve(spread[np.ix_(_LEVEL, _LEVEL)], gaps[:, _LEVEL].T).T
-    )
-    # densities by odometry's drift, in multiples of that of a slip, which is even within the reach of moved parts
-    there = math.pi * FARTHEST_MOVED**2 / math.sqrt(float(np.linalg.det(2.0 * np.pi * spread[3:5, 3:5])))
-    density = there * np.exp(-0.5 * distance)
+    there, distance = _by_drift(gaps, spread)
+    near, since = distance <= chi2_quantile(len(_LEVEL), config.acceptance.risk), np.zeros(len(at))
+    if begin is not None and near.any():
+        T_odom_first, path = scorer.look_back(np.stack(at)[near])
+        gap = (begin.T_map_odom @ T_odom_first)[:2, 3] - path[:, :2]
+        scatter = registered[3:5, 3:5] + SCATTER**2 * np.eye(2)
+        size, axes = np.linalg.eigh((lost.covariance - begin.covariance)[3:5, 3:5])  # a way back unwinds drift
+        grown = scatter + (axes * np.maximum(size, 0.0)) @ axes.T
+        later = gaps[near, 3:5] - gap
+        since[near] = np.einsum("ki,ki->k", later, np.linalg.solve(grown, later.T).T)
+        spread[3:5], spread[:, 3:5], gaps[near, 3:5] = 0.0, 0.0, gap
+        spread[3:5, 3:5] = begin.covariance[3:5, 3:5] + scatter
+        there[near], distance[near] = _by_drift(gaps[near], spread)
+    along = np.exp(-0.5 * since)  # also after a slip
+    density = along * there * np.exp(-0.5 * distance)
     first = np.array([k == 0 or same_place(T, at[0], request, BASIN_DISTANCE, BASIN_ANGLE) for k, T in enumerate(at)])
     scored = scored.weighed(np.minimum(density, 1.0) / lost.odds, first)
-    metres, radians = np.linalg.norm(gaps[:, 3:], axis=1), np.abs(gaps[:, 2])
     at_end = (metres <= 0.5 * ALERT_METRES) & (radians <= math.radians(0.5 * ALERT_DEGREES))
     if at_end[0]:
         return scored  # both may be right
     right = log_odds_of_moved(base_map.field, scans, at[0], lost.T_map_odom)
-    apart = distance[0] > chi2_quantile(len(_LEVEL), config.acceptance.risk)  # else both are modes of one place
+    apart = distance[0] + since[0] > chi2_quantile(
+        len(_LEVEL), config.acceptance.risk
+    )  # else both are modes of one place
     if apart and not (at_end & ~first).any():  # it is not weighed yet
         here, beside = scorer.beside(np.stack([at[0], lost.T_map_odom]))
-        right = float(np.logaddexp(right, math.log(there) + beside - here))
-    odds = math.exp(min(right, 100.0)) / (density[0] + lost.odds)
+        right = float(np.logaddexp(right, math.log(there[0]) + beside - here))
+    odds = math.exp(min(right, 100.0)) / (density[0] + along[0] * lost.odds)
     return scored.beside([Hypothesis(lost.T_map_odom, probability=float(odds))])
+
+
+def _by_drift(gaps: Floats, spread: Floats) -> tuple[Floats, Floats]:
+    """Return the density of odometry's drift at no gap, and squared distances, of gaps (P, 6) with a spread (6, 6).
+
+    Densities are multiples of that of a slip, which is even within the reach of moved parts.
+    """
+    level = gaps[:, _LEVEL]
+    distance = np.einsum("ki,ki->k", level, np.linalg.solve(spread[np.ix_(_LEVEL, _LEVEL)], level.T).T)
+    there = math.pi * FARTHEST_MOVED**2 / math.sqrt(float(np.linalg.det(2.0 * np.pi * spread[3:5, 3:5])))
+    return np.full(len(gaps), there), distance

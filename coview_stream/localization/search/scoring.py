@@ -250,6 +250,13 @@ class PlaceScorer:
         rows = zip(at, part.scores[new].tolist(), ratios.tolist(), odds.tolist(), strict=True)
         return [Hypothesis(T, score=score, ratio=ratio, probability=each) for T, score, ratio, each in rows]
 
+    def look_back(self, T_map_odom: Floats) -> tuple[Pose, Floats]:
+        """Return odometry's pose (4, 4) at the first keyframe, and there poses (M, 4) of the paths of (M, 4, 4)."""
+        newest = self._scans[-1].poses(T_map_odom)
+        observed, poses = look_back(self._base_map.field, self._scans[:-1], self._scans[-1].transforms(newest))
+        poses = np.concatenate([poses, newest[:, None]], axis=1)
+        return self._scans[0].T_odom_body, Paths.of(self._base_map.field, self._scans, poses, observed).poses[:, 0]
+
     def beside(self, T_map_odom: Floats) -> Floats:
         """Return log-likelihood ratios (M,) of poses (M, 4, 4) beside the most probable place.
 

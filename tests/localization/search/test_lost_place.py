@@ -29,20 +29,27 @@ def request_(world_drive):
 
 
 class Silent:
-    """A scorer by which all poses explain the keyframes equally."""
+    """A scorer by which all poses explain the keyframes equally, and all paths lead through the truth."""
+
+    def __init__(self, request):
+        self.request = request
 
     def beside(self, poses):
         return np.zeros(len(poses))
 
+    def look_back(self, poses):
+        return self.request.T_odom_body, np.tile((T_MAP_ODOM @ self.request.T_odom_body)[:3, 3], (len(poses), 1))
 
-def weighed(world_map, request, others=(), alone=0.1):
+
+def weighed(world_map, request, others=(), alone=0.1, begin=None):
     """The places of a search whose first is the truth, wrong with probability ``alone`` by the scans, and others."""
     second = place(0.5 * alone, pose_from(np.eye(3), [50.0, 0.0, 0.0]) @ T_MAP_ODOM)
     places = [place(1.0 - alone - sum(each.probability for each in others), T_MAP_ODOM), *others, second]
     error = alone + sum(each.probability for each in others)
     scored = Scored(0, places, error, 0.5 * alone, 1e-3, places[1])
     scans = [observed(request.cloud, request.T_odom_body)]
-    out = weighed_by_odometry(scored, candidate(places[0]), request, scans, world_map, LocalizerConfig(), Silent())
+    context = request, scans, world_map, LocalizerConfig(), Silent(request), begin
+    out = weighed_by_odometry(scored, candidate(places[0]), *context)
     assert out.none + sum(each.probability for each in out.places) == pytest.approx(1.0)
     return out
 
@@ -80,3 +87,16 @@ def test_path_that_leads_beside_it_contradicts_it_unless_odometry_went_wrong(wor
 def test_path_that_drifts_as_far_does_not_contradict_it(world_map, request_):
     result = searching(world_map).update(lost(request_, 1.5, 1e-3, sigma=1.0))
     assert result.evidence.state is State.TRACKING
+
+
+def test_drift_has_to_explain_the_distance_at_the_first_keyframe(world_map, world_drive, request_):
+    """Where odometry led away from the search's places at once, it did not drift there on the way since."""
+    request = lost(request_, 1.5, 1e-3, sigma=1.0)
+    at_once, later = (
+        weighed(world_map, request, begin=lost(request_, metres, 1e-3).lost).error for metres in (1.5, 0.05)
+    )
+    assert at_once > 0.9
+    assert later < 0.01
+    search, requests = searching(world_map), run_of(world_drive, 4)
+    results = [search.update(lost(each, 1.5, 1e-3, 0.1 if k == 0 else 1.0)) for k, each in enumerate(requests)]
+    assert {result.evidence.state for result in results} == {State.AMBIGUOUS}
