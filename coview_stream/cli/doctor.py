@@ -72,7 +72,7 @@ def _conclusion(findings: list[Finding], args: argparse.Namespace) -> str:
     problems, warnings = (sum(finding.verdict == verdict for finding in findings) for verdict in ("FAIL", "warn"))
     if not problems + warnings:
         asked = {"the map": args.map, "the run": args.run_path, "the robots": args.robot}
-        checked = " and ".join(["this machine", *(name for name, given in asked.items() if given)])
+        checked = ", ".join(["this machine", *(name for name, given in asked.items() if given)])
         clouds = args.run_path or args.robot
         more = "a delay or a wrong mount shows only in turns" if clouds else "clouds were not checked: --robot, --run"
         return f"no problem found with {checked} ({more})"

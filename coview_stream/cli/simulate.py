@@ -33,7 +33,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         metavar="KINDS",
         help="imperfections, e.g. rain,snow:0.4 (a number says how strong); real is all of motion, traffic, rain, "
         "dust, beams, reflectors, glass, mounting, gravity, odometry, slip, strips, density, seasons, years, grass, "
-        "snow; values, with units, are printed at the end (none)",
+        "snow; the imperfections, with units, are printed at the end (none)",
     )
     parser.add_argument("--dirt-seed", type=int, default=0, help="seed of the dirt alone (0)")
     parser.add_argument("--utm", action="store_true", help="put the map at UTM-like coordinates")

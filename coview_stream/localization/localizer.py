@@ -103,6 +103,7 @@ class Localizer(SavedState):
         self._confidence = 0.0  # of the search's acceptance
         self._wrong = 0.0  # probability that the place is wrong, by the newest registration
         self._registered_at = 0.0  # stamp of the newest registration
+        self._cut_short = False  # an exception has ended the newest frame
 
     def __repr__(self) -> str:
         """Return the state, the stamp of the newest frame and the map, in one line."""
@@ -152,21 +153,18 @@ class Localizer(SavedState):
         Raises:
             CloudError: the cloud has another shape, fewer than 10 finite points, or lies kilometres off. RunError: the
                 pose is not rigid, or the stamp is not in seconds or not after the previous frame's. Neither changes the
-                localizer: count the frame, skip it and go on. KeyboardInterrupt: half the frame is in, so the localizer
-                has begun to search anew (:meth:`relocalize`).
+                localizer: count the frame, skip it and go on. After any other exception, say of Ctrl-C, the next
+                frame begins with :meth:`relocalize`, as this one is half in.
         """
-        try:
-            frame, request = self._predict(cloud, T_odom_body, stamp)  # T_map_body = T_map_odom T_odom_body
-            if self.state.has_place:
-                match = self._match_to_map(frame)  # eq. 13, from the prediction; None where none is due
-                if match is not None:
-                    self._update(match)  # verify, correct the graph of poses, change the state
-            elif request is not None:
-                self.apply_search_result(self.search.update(request))  # eqs 1-13, over the whole map
-            return self.fix()
-        except KeyboardInterrupt:
-            self.relocalize()
-            raise
+        frame, request = self._predict(cloud, T_odom_body, stamp)  # T_map_body = T_map_odom T_odom_body
+        if self.state.has_place:
+            match = self._match_to_map(frame)  # eq. 13, from the prediction; None where none is due
+            if match is not None:
+                self._update(match)  # verify, correct the graph of poses, change the state
+        elif request is not None:
+            self.apply_search_result(self.search.update(request))  # eqs 1-13, over the whole map
+        self._cut_short = False
+        return self.fix()
 
     def add_frame(
         self, cloud: Reals, T_odom_body: Pose, stamp: float, defer: bool = False,
@@ -186,6 +184,7 @@ class Localizer(SavedState):
         match = self._match_to_map(frame, defer, on_doubt) if self.state.has_place else None
         if match is not None:
             self._update(match)
+        self._cut_short = False
         return request
 
     def apply_search_result(self, result: SearchResult) -> None:
@@ -312,6 +311,9 @@ class Localizer(SavedState):
     def _predict(self, cloud: Reals, T_odom_body: Pose, stamp: float) -> tuple[PreparedFrame, SearchRequest | None]:
         """Check a frame and predict its pose by odometry; return it and the request of a search, if one is due."""
         points, T_odom_raw = self._frames.validate(cloud, T_odom_body, stamp)
+        if self._cut_short:
+            self.relocalize()
+        self._cut_short = True
         if self._frames.steps.add(T_odom_raw, stamp):
             self._requests.odometry_jumped(None if self._newest is None else self._newest.T_odom_body)
             if self.state.has_place and self._newest is not None:  # the robot was moved, or is still here

@@ -26,7 +26,7 @@ _FOLDERS = {
     "Scans": ("odom_poses.txt", "optimized_poses.txt"),  # saved by SC-LIO-SAM and SC-A-LOAM
 }
 """Folders of frames, and odometry files next to them; the first existing file counts."""
-_NUMBERS = re.compile(r"(\d+(?:\.\d+)?)")  # in a frame's name: numbers and stamps
+_NUMBERS = re.compile(r"((?<![\d.])\d+\.\d+(?![\d.])|\d+)")  # in a frame's name: stamps, dates and numbers
 _MULRAN_SWEEPS = ("sensor_data/Ouster", "Ouster")
 _LAYOUTS = (
     "frames/NNNNNN.pcd (ply, bin, npy, las, laz) beside odometry.tum, KITTI's velodyne/*.bin with times.txt and "
@@ -134,14 +134,17 @@ def _frames(folder: Path) -> tuple[Path, ...]:
     for file in files:
         if not file.is_file():
             raise RunError(f"{file}: is not a file (a directory or a broken link); put the cloud itself there")
-    numbered = [file for file in files if file.stem.isdecimal()]
+    names = {file: file.name[: -len(suffix_of(file))] for file in files}
+    numbered = [file for file in files if _NUMBERS.fullmatch(names[file])]
     if numbered and (others := sorted(set(files) - set(numbered))):
-        raise RunError(f"{others[0]}: has no number, unlike {min(numbered).name}; rename it or move it away")
-    files.sort(
-        key=lambda file: [Decimal(part) if at % 2 else part for at, part in enumerate(_NUMBERS.split(file.stem))]
-    )
-    for before, after in pairwise(files if numbered else ()):
-        if int(before.stem) == int(after.stem):
+        raise RunError(f"{others[0]}: is not named by a number alone, unlike {min(numbered).name}; rename or remove it")
+    order = {
+        file: [Decimal(part) if at % 2 else part for at, part in enumerate(_NUMBERS.split(name))]
+        for file, name in names.items()
+    }
+    files.sort(key=lambda file: (order[file], file.name))
+    for before, after in pairwise(files):
+        if order[before] == order[after]:
             raise RunError(f"{folder}: {before.name} and {after.name} are the same frame; remove one")
     return tuple(files)
 

@@ -108,7 +108,7 @@ def _place_all(
     if failed:
         notes.append(f"{path}: lidar odometry could not place {len(failed)} of {count} frames; first: {failed[0]}")
     if lidar.restarts:
-        notes.append(f"{path}: lidar odometry began anew {lidar.restarts} times; poses of that stretch are missing")
+        notes.append(f"{path}: lidar odometry began anew {lidar.restarts} times; poses of those stretches are missing")
     return placed, np.array(poses), notes
 
 

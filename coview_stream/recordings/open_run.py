@@ -88,5 +88,5 @@ def open_run(
         )
     stamps, poses = read_odometry(layout, explicit)
     apart = float(np.median(np.diff(stamps))) if count > 1 else 0.0
-    notes = (f"{path}: frames are {apart:.4g} s apart; stamps have to be in seconds",) * (apart >= _MILLISECONDS)
+    notes = (f"{path}: frames are {apart:.4g} s apart: are the stamps in seconds?",) * (apart >= _MILLISECONDS)
     return Run(path, layout.frames, stamps, poses, notes=notes, mount=mount)

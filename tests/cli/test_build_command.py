@@ -132,7 +132,7 @@ def test_directory_of_tiles_is_built_converted_and_shown(cloud, tmp_path, capsys
     assert main(["convert", str(tmp_path / "one.coview"), str(tmp_path / "back")]) == 0
     assert "tiles of 320 m" in capsys.readouterr().out
     (tmp_path / "thesis").write_text("years of work")
-    assert "no coview map" in refused("convert", site, tmp_path / "thesis")
+    assert "not a coview map" in refused("convert", site, tmp_path / "thesis")
 
 
 def test_only_a_map_file_is_overwritten(cloud, tmp_path, refused):
@@ -141,7 +141,7 @@ def test_only_a_map_file_is_overwritten(cloud, tmp_path, refused):
     assert "given twice" in refused("build", cloud, cloud, "-o", tmp_path / "site.coview")
     other = tmp_path / "thesis"
     other.write_text("years of work")
-    assert "no coview map" in refused("build", cloud, "-o", other)
+    assert "not a coview map" in refused("build", cloud, "-o", other)
     assert "not a regular file" in refused("build", cloud, "-o", "/dev/null")
     assert cloud.read_bytes() == before
     assert other.read_text() == "years of work"

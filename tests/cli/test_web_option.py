@@ -13,7 +13,7 @@ from sockets import free_endpoint
 
 @pytest.mark.parametrize("command", [["serve", "--robot", "r1", "--web", "site.coview"], ["watch", "--web", "here"]])
 def test_what_is_no_address_is_refused(command, refused):
-    assert "no HOST:PORT; write --web=127.0.0.1:8642" in refused(*command)
+    assert "not HOST:PORT; write --web=127.0.0.1:8642" in refused(*command)
 
 
 def test_a_port_that_is_taken_ends_watch_with_one_line(refused):

@@ -63,7 +63,7 @@ def test_content_of_another_format_is_refused(tmp_path, real, named):
         ("a.ply", b"ply\nformat ascii 1.0\nelement face 0\nend_header\n", "without a vertex"),
         ("a.ply", b"ply\nformat ascii 1.0\nelement vertex 1\nproperty float x\nend_header\n1\n", "have no y, z"),
         ("a.ply", b"ply\nformat odd 1.0\nend_header\n", "damaged PLY header"),
-        ("a.bin", b"\x01\xff" * 15, "no multiple"),
+        ("a.bin", b"\x01\xff" * 15, "not a multiple"),
     ],
 )
 def test_damaged_content_is_refused_with_reason(tmp_path, name, content, reason):

@@ -48,7 +48,7 @@ def test_missing_returns_stay_missing():
         ("nan,0,0", "not finite"),
         ("0,361,0", "beyond 360 degrees"),
         ("-720,0,0", "beyond 360 degrees"),
-        ("0,0,0,0,0,1500", "no mount"),
+        ("0,0,0,0,0,1500", "not a mount"),
     ],
 )
 def test_mount_that_is_none_is_refused_in_one_line(text, said):

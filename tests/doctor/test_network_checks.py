@@ -140,7 +140,7 @@ def test_connection_finding_explains_unreachable_endpoint():
 
 
 def test_tcp_probe_of_unknown_host_and_other_protocol():
-    assert "no host" in try_tcp("tcp/no-such-host.invalid:7447")
+    assert "not a host" in try_tcp("tcp/no-such-host.invalid:7447")
     assert try_tcp("udp/127.0.0.1:7447") == "does not answer"
 
 

@@ -63,7 +63,7 @@ def refused(decode, payload, name, attachment=bytes(8)):
         (ROWS, b"", "no stamp"),
         (ROWS, bytes(7), "no stamp"),
         (ROWS, bytes(33), "no stamp"),
-        (ROWS[:-1], bytes(8), "no whole number"),
+        (ROWS[:-1], bytes(8), "not a whole number"),
     ],
 )
 def test_malformed_raw_clouds_are_refused(payload, attachment, reason):
@@ -104,7 +104,7 @@ def test_malformed_point_cloud_2_is_refused(payload, reason):
     ("payload", "reason"),
     [
         (b"\xff", "truncated"),
-        (b"\x0b", "no protobuf"),  # a group
+        (b"\x0b", "not a protobuf"),  # a group
         (b"\x02\x00", "malformed"),  # field number 0
         (VALID["foxglove"][:-1], "truncated"),
         (b"\x32\xff\xff\xff\xff\x0f", "truncated"),  # 4 GiB of points announced
@@ -170,7 +170,7 @@ def odometry_json(**changes):
     ("payload", "reason"),
     [
         (b"", "no JSON"),
-        (b"[]", "no object"),
+        (b"[]", "not an object"),
         (b"\xff\xfe{", "no JSON"),
         (b"[" * 60_000, "no JSON"),
         (b'{"stamp_ns":' + b"9" * 5000 + b"}", "no JSON"),

@@ -198,18 +198,34 @@ def test_duplicate_frames_and_broken_links_are_refused(run):
 def test_stamps_in_milliseconds_are_noted(run):
     assert open_run(run).notes == ()
     write_tum(run / "odometry.tum", 1000.0 * (STAMPS - STAMPS[0]), POSES)
-    assert open_run(run).notes == (f"{run}: frames are 100 s apart; stamps have to be in seconds",)
+    assert open_run(run).notes == (f"{run}: frames are 100 s apart: are the stamps in seconds?",)
 
 
-def test_frames_are_ordered_by_the_numbers_in_their_names(run):
-    """So that frame 10 does not follow frame 1; a copy without a number would shift all poses behind it."""
-    names = {"000000": "scan_9.5", "000001": "scan_9.25", "000002": "scan_10", "000003": "scan_100"}
-    for path in (run / "frames").iterdir():
-        path.rename(path.with_stem(names.get(path.stem, path.stem)))
-    frames = find_layout(run).frames
-    assert [path.stem for path in frames] == ["scan_9.25", "scan_9.5", "scan_10", "scan_100"]
-    frames[0].rename(frames[0].with_stem("7"))
-    with pytest.raises(RunError, match=r"scan_10\.pcd: has no number, unlike 7\.pcd"):
+@pytest.mark.parametrize(
+    "names",
+    [
+        ("scan_9.25", "scan_9.5", "scan_10", "scan_100"),
+        ("1564718964", "1564718964.1", "1564718964.15", "1564718964.2"),
+        ("2020.9.30", "2020.10.1", "2020.10.2", "2020.10.10"),
+    ],
+)
+def test_frames_are_ordered_by_the_numbers_in_their_names(run, names):
+    for k, name in enumerate(names):
+        (run / "frames" / f"{k:06d}.pcd").rename(run / "frames" / f"{name}.pcd")
+    assert tuple(path.stem for path in find_layout(run).frames) == names
+
+
+@pytest.mark.parametrize(
+    ("name", "reason"),
+    [
+        ("000001 (1).pcd", r"000001 \(1\)\.pcd: is not named by a number alone, unlike 000000\.pcd"),
+        ("1.xyz.gz", "are the same frame; remove one"),
+    ],
+)
+def test_copies_of_a_frame_are_refused(run, name, reason):
+    """One frame more would shift all poses behind it."""
+    (run / "frames" / name).touch()
+    with pytest.raises(RunError, match=reason):
         find_layout(run)
 
 

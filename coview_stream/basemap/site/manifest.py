@@ -179,8 +179,8 @@ class Manifest:
     def from_bytes(cls, raw: bytes, name: str, key: VerifyKey | None = None) -> Manifest:
         """Read untrusted bytes of :meth:`to_bytes`, or of earlier versions, which were indented.
 
-        Checks the signature first if there is a key. MapError if that is wrong or missing, if the bytes hold no
-        manifest, or if their version is unknown.
+        Checks the signature first if there is a key. MapError if the signature is wrong or missing, if the bytes are
+        not a manifest, or if their version is unknown.
         """
         try:
             if len(raw) > MAX_MANIFEST:

@@ -33,6 +33,7 @@ from coview_stream.localization.search.request import (
 )
 from coview_stream.localization.search.scoring import PlaceScorer
 
+_NEWEST_LOST = 8  # newest keyframes whose lost places are kept, as a search may go on from them
 _ORDINARY = 20_000  # stations up to which the configured number of co-view hypotheses is enough
 _GUESSES = 12  # most poses of a guess, and most rivals to register, that a keyframe tries
 _NAMED = 4  # places like the leader, and rivals, that are looked at more closely, and by the next keyframe
@@ -128,7 +129,7 @@ class GlobalSearch:
         self._guesses = HintSchedule()
         self._scorer.clear()
         self._keyframes = 0
-        self._lost: LostPlace | None = None  # at the first keyframe
+        self._lost: list[LostPlace | None] = []  # at the first keyframe and the newest
         self._named: list[tuple[Hypothesis, int]] = []  # places for the next keyframe, each with its rank in the votes
 
     def reset(self) -> None:
@@ -141,8 +142,7 @@ class GlobalSearch:
         """Search the map for one keyframe; another epoch or an acceptance starts a new search."""
         if request.epoch != self._epoch:
             self._begin(request)
-        if not self._scorer.scans:
-            self._lost = request.lost
+        self._lost = [*self._lost[:1], *self._lost[1:][-_NEWEST_LOST:], request.lost]
         self._scorer.area = request.area
         self._vote(request)  # eqs 1-9: descriptors, compared with all stations at all turns
         voted, ranks = self._propose()  # eq. 12: peaks of the consensus as T_map_odom
@@ -174,7 +174,7 @@ class GlobalSearch:
         if leader is not None:
             scored = self._gathered(scored, leader, scan, request)
             scans = [scan] if reading.leans else [*self._scorer.scans[:-1], scan]
-            begin = self._lost if len(scans) > 1 else None
+            begin = self._lost[0] if len(scans) > 1 else None
             context = request, scans, self.base_map, self.config, reading.scorer, begin
             if weighed_by_odometry(scored, leader, *context).error < self.config.acceptance.risk:
                 place = scored.places[0]
@@ -281,9 +281,9 @@ class GlobalSearch:
         """Restart with a request, or continue with its earlier keyframes, which does not count as another start."""
         starts = self._scorer.starts + (bool(self._scorer.scans) and not request.earlier)
         keyframes = self._keyframes if request.earlier else 0
+        lost = self._lost[-len(request.earlier) :] if request.earlier else []
         self.clear()
-        self._epoch, self._scorer.starts, self._keyframes = request.epoch, starts, keyframes
-        self._lost = request.lost
+        self._epoch, self._scorer.starts, self._keyframes, self._lost = request.epoch, starts, keyframes, lost
         self._scorer.go_on_with([self._observed(each) for each in request.earlier])
 
     def _observed(self, keyframe: SearchRequest | EarlierKeyframe) -> ObservedScan:

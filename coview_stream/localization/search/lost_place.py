@@ -31,6 +31,7 @@ from coview_stream.localization.search.request import LostPlace, SearchRequest, 
 from coview_stream.localization.search.scoring import PlaceScorer
 
 _LEVEL = [3, 4, 5, 2]  # x, y, z and heading of (rx, ry, rz, x, y, z)
+_FAR = 600.0  # squared distance, at most: odds stay finite
 _HEIGHT = 0.5  # metres, sigma of the ground's height against the survey's: grass, snow, dug ground
 
 
@@ -54,6 +55,7 @@ def weighed_by_odometry(
     spread = lost.covariance + registered + np.diag([0.0, 0.0, 0.0, 0.0, 0.0, _HEIGHT**2])
     there, distance = _by_drift(gaps, spread)
     near, since = distance <= chi2_quantile(len(_LEVEL), config.acceptance.risk), np.zeros(len(at))
+    slipped = lost.odds if begin is None else min(begin.odds, lost.odds)  # by the first keyframe
     if begin is not None and near.any():
         T_odom_first, path = scorer.look_back(np.stack(at)[near])
         gap = (begin.T_map_odom @ T_odom_first)[:2, 3] - path[:, :2]
@@ -61,11 +63,11 @@ def weighed_by_odometry(
         size, axes = np.linalg.eigh((lost.covariance - begin.covariance)[3:5, 3:5])  # a way back unwinds drift
         grown = scatter + (axes * np.maximum(size, 0.0)) @ axes.T
         later = gaps[near, 3:5] - gap
-        since[near] = np.einsum("ki,ki->k", later, np.linalg.solve(grown, later.T).T)
+        since[near] = np.minimum(np.einsum("ki,ki->k", later, np.linalg.solve(grown, later.T).T), _FAR)
         spread[3:5], spread[:, 3:5], gaps[near, 3:5] = 0.0, 0.0, gap
         spread[3:5, 3:5] = begin.covariance[3:5, 3:5] + scatter
         there[near], distance[near] = _by_drift(gaps[near], spread)
-    along = np.exp(-0.5 * since)  # also after a slip
+    along = np.exp(-0.5 * since)
     density = along * there * np.exp(-0.5 * distance)
     first = np.array([k == 0 or same_place(T, at[0], request, BASIN_DISTANCE, BASIN_ANGLE) for k, T in enumerate(at)])
     scored = scored.weighed(np.minimum(density, 1.0) / lost.odds, first)
@@ -79,7 +81,7 @@ def weighed_by_odometry(
     if apart and not (at_end & ~first).any():  # it is not weighed yet
         here, beside = scorer.beside(np.stack([at[0], lost.T_map_odom]))
         right = float(np.logaddexp(right, math.log(there[0]) + beside - here))
-    odds = math.exp(min(right, 100.0)) / (density[0] + along[0] * lost.odds)
+    odds = math.exp(min(right, 100.0)) / (density[0] + along[0] * slipped + lost.odds - slipped)
     return scored.beside([Hypothesis(lost.T_map_odom, probability=float(odds))])
 
 

@@ -236,7 +236,7 @@ class MapMatcher:
                 match = min(verified, key=lambda other: off_by(right, other.T_map_body)[0], default=match)
                 moves = not matters(*off_by(right, match.T_map_body))
                 metres, degrees = off_by(match.T_map_body, T_map_predicted)
-        reason = f"odometry is {metres:.2f} m and {degrees:.1f} degrees off the lidar's motion"
+        reason = f"odometry is {metres:.2f} m and {degrees:.1f} degrees off the place that the scan fits"
         if not moves:
             reason += ", and the scan fits there hardly better than elsewhere: something may have been moved"
         verdict = replace(match.verdict, cause=RejectionReason.ODOMETRY, reason=reason)

@@ -35,7 +35,7 @@ class MapServer:
         listen: Sequence[str] = (),
         config: Path | None = None,
     ) -> None:
-        """Open a session and start answering; MapError if it serves no site, TransportError without network."""
+        """Open a session and start answering; MapError for no site, TransportError without network."""
         import zenoh
 
         self._raw = read_manifest(directory)

@@ -54,7 +54,7 @@ def test_mirror_is_the_site_and_is_opened_without_the_source(site):
     assert len(BaseMap.load(path)) == sum(tile.stations for tile in Manifest.load(site).tiles)
     source.gone = True
     again = Mirror(source)
-    with pytest.warns(CoViewWarning, match="nobody answers; going on with what was fetched before"):
+    with pytest.warns(CoViewWarning, match="nobody answers; going on with the tiles fetched before"):
         assert again.open() == path
     assert "nobody answers" in again.offline
     source.gone, asked = False, len(source.asked)
@@ -126,7 +126,7 @@ def test_manifest_has_to_be_signed_where_a_key_is_asked_for(site, tmp_path):
         Mirror(Directory(site), other).open()
     manifest = Manifest.load(site)
     replace(manifest, tiles=manifest.tiles[1:]).save(site)
-    with pytest.warns(CoViewWarning, match="is not signed with .* going on with what was fetched before"):
+    with pytest.warns(CoViewWarning, match="is not signed with .* going on with the tiles fetched before"):
         assert Mirror(Directory(site), owner).open() == path
     assert Manifest.load(path) == manifest
     source = Directory(site)
@@ -270,7 +270,7 @@ def test_server_that_lies_is_no_reason_not_to_start(fetched, monkeypatch, lie):
             Manifest.from_bytes(web.manifest(), address)
         web.name = source.name  # of the mirror in the cache
         web.manifest = WebSource(address).manifest
-        with pytest.warns(CoViewWarning, match="going on with what was fetched before"):
+        with pytest.warns(CoViewWarning, match="going on with the tiles fetched before"):
             path = Mirror(web).open()
     assert Manifest.load(path) == Manifest.load(source.directory)
 

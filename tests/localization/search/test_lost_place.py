@@ -12,7 +12,7 @@ from coview_stream.config import LocalizerConfig
 from coview_stream.geometry.transforms import inverse, pose_from, rot_z
 from coview_stream.localization.search.lost_place import weighed_by_odometry
 from coview_stream.localization.search.places import Scored
-from coview_stream.localization.search.request import LostPlace
+from coview_stream.localization.search.request import EarlierKeyframe, LostPlace
 from coview_stream.localization.state import State
 
 
@@ -38,7 +38,9 @@ class Silent:
         return np.zeros(len(poses))
 
     def look_back(self, poses):
-        return self.request.T_odom_body, np.tile((T_MAP_ODOM @ self.request.T_odom_body)[:3, 3], (len(poses), 1))
+        return self.request.T_odom_body, np.tile(
+            [*(T_MAP_ODOM @ self.request.T_odom_body)[:3, 3], 0.0], (len(poses), 1)
+        )
 
 
 def weighed(world_map, request, others=(), alone=0.1, begin=None):
@@ -97,6 +99,12 @@ def test_drift_has_to_explain_the_distance_at_the_first_keyframe(world_map, worl
     )
     assert at_once > 0.9
     assert later < 0.01
+    slipped = lost(request_, 1.5, 1e6, sigma=1.0)  # since then, by the clouds
+    assert weighed(world_map, slipped, begin=lost(request_, 0.05, 1e-3).lost).error < 0.2
     search, requests = searching(world_map), run_of(world_drive, 4)
-    results = [search.update(lost(each, 1.5, 1e-3, 0.1 if k == 0 else 1.0)) for k, each in enumerate(requests)]
+    results = [search.update(lost(each, 1.5, 1e-3, 0.1 if k < 2 else 1.0)) for k, each in enumerate(requests)]
     assert {result.evidence.state for result in results} == {State.AMBIGUOUS}
+    *before, newest = run_of(world_drive, 5)  # clouds are levelled anew
+    earlier = tuple(EarlierKeyframe(each.T_odom_body, each.submap, each.cloud) for each in before[1:])
+    request = replace(lost(newest, 1.5, 1e-3, 1.0), earlier=earlier, epoch=newest.epoch._replace(restart=1))
+    assert search.update(request).evidence.state is State.AMBIGUOUS

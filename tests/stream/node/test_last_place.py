@@ -62,7 +62,7 @@ def test_calibration_of_no_robot_spoils_the_file(tmp_path, caplog, wrong):
     document = json.loads(path.read_text()) | {"calibration": wrong}
     path.write_text(json.dumps(document))
     assert load(tmp_path, "r1", SHA) is None
-    assert "no last pose to be used" in caplog.text
+    assert "no last pose that can be used" in caplog.text
 
 
 def test_calibration_with_fields_of_another_release_is_read(tmp_path):
