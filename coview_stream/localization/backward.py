@@ -86,6 +86,7 @@ class RecordingLocalizer(Localizer):
                 T_odom_body=frame.T_odom_body, calibration=level,
             )
         )  # fmt: skip
+        self._cut_short = False
 
     def fit(self, cloud: Points, T_map_body: Pose, calibration: Calibration) -> float:
         """Return the share of a frame's structure that lies on the map at a body pose (4, 4); 0 for too few points.
