@@ -55,8 +55,9 @@ def run(args: argparse.Namespace) -> int:
 def table(evaluation: Evaluation) -> str:
     """Return the evaluation as lines of names and values."""
     first = "never" if evaluation.first_fix_m is None else f"after {evaluation.first_fix_m:.1f} m"
+    failure = "no: the first pose or 5 % of all are wrong" if evaluation.posed else "no: no pose"
     rows = [
-        ("success", "yes" if evaluation.success else "no"),
+        ("success", "yes" if evaluation.success else failure),
         ("localized", f"{evaluation.share_localised:.1%} of {counted(evaluation.frames, 'frame')}"),
         ("false frames", f"{evaluation.false_frames} of {counted(evaluation.posed, 'pose')}"),
         ("first pose", first),

@@ -186,7 +186,7 @@ def place_finding(run: Run, base_map: BaseMap, config: LocalizerConfig, progress
             reason = reason if evidence is None else evidence.reason.removeprefix("found: ")
             if localizer.state is State.TRACKING:
                 break
-        after = f"in the first {metres[index]:.0f} of {metres[-1]:.0f} m" if goes_on else f"after {metres[index]:.0f} m"
+        after = f"after {metres[index]:.0f}" + f" of {metres[-1]:.0f}" * goes_on + " m"
         return metres[index], localizer.state, f"{after}: {reason or 'too little has been seen'}"
 
     step = max(1, len(run) // _SEARCHED)

@@ -111,6 +111,7 @@ class RunResult:
         smoothed: poses by the whole run, in order; None unless requested.
         considered: places of the newest search, if no frame has a pose; else None.
         node_reason: why there was no pose, as reported by a node; empty without a node.
+        late: clause on the work that a node's machine had no time for; empty if there was none.
     """
 
     frames: int
@@ -126,6 +127,7 @@ class RunResult:
     smoothed: list[SmoothedPose] | None = None
     considered: Considered | None = None
     node_reason: str = ""
+    late: str = ""
 
     @property
     def reason(self) -> str:
@@ -339,11 +341,12 @@ def from_stream(
             if not located.keyframes or located.keyframes[-1].stamp != evidence.stamp:
                 located.keyframes.append(evidence)
     if live := [status for status in statuses if "counters" in status and not status["node"]["ending"]]:
-        located.node_reason = _dropped(live[-1]["counters"], len(stamps)) + live[-1]["reason"]
+        located.late = _late(live[-1]["counters"], len(stamps))
+        located.node_reason = "; ".join(part for part in (located.late, live[-1]["reason"]) if part)
     return located
 
 
-def _dropped(counters: dict[str, int], frames: int) -> str:
+def _late(counters: dict[str, int], frames: int) -> str:
     """Return a clause on the work that a node's machine dropped for lack of time; empty if there was none."""
     searches = counters["searches"] + counters["searches_skipped"]
     parts = [
@@ -351,7 +354,7 @@ def _dropped(counters: dict[str, int], frames: int) -> str:
         (counters["searches_skipped"], searches, "keyframes to search for"),
     ]
     said = [f"{number} of {total} {name}" for number, total, name in parts if number]
-    return f"the machine had no time for {' and '.join(said)}; " if said else ""
+    return f"the machine had no time for {' and '.join(said)}" if said else ""
 
 
 def write(located: RunResult, base_map: BaseMap, out: str | os.PathLike[str]) -> None:
@@ -424,7 +427,8 @@ def _trajectory(posed: Sequence[Fix] | Sequence[SmoothedPose]) -> tuple[Floats, 
 
 def _usual_reason(gap: Sequence[Fix]) -> str:
     """Return the newest reason that has the most frequent cause: at first the cause may not be clear."""
-    reasons = [(fix.state.reported, None) if (e := fix.evidence) is None else (e.reason, e.cause) for fix in gap]
+    unsaid = {state: "the node published no pose" if state.has_place else state.reported for state in State}
+    reasons = [(unsaid[fix.state], None) if (e := fix.evidence) is None else (e.reason, e.cause) for fix in gap]
     cause = Counter(cause for _, cause in reasons).most_common(1)[0][0]
     return next(reason for reason, other in reversed(reasons) if other is cause)
 

@@ -6,8 +6,6 @@ import os
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-import numpy as np
-
 from coview_stream.config.mount import Mount
 from coview_stream.errors import RunError
 from coview_stream.recordings.datasets import is_kitti_raw, open_kitti_raw, open_mulran
@@ -21,7 +19,6 @@ if TYPE_CHECKING:
 
 KISS_ICP = "kiss-icp"
 """Instead of an odometry file: compute odometry from the clouds."""
-_MILLISECONDS = 10.0  # between frames: 10 ms, the least of lidars, if it is taken for seconds
 
 
 def open_run(
@@ -87,6 +84,4 @@ def open_run(
             "(t x y z qx qy qz qw per frame) or name a file, or make it of the clouds: --odometry kiss-icp"
         )
     stamps, poses = read_odometry(layout, explicit)
-    apart = float(np.median(np.diff(stamps))) if count > 1 else 0.0
-    notes = (f"{path}: frames are {apart:.4g} s apart: are the stamps in seconds?",) * (apart >= _MILLISECONDS)
-    return Run(path, layout.frames, stamps, poses, notes=notes, mount=mount)
+    return Run(path, layout.frames, stamps, poses, mount=mount)

@@ -67,6 +67,14 @@ def test_run_outside_the_map_exits_with_one(world_file, elsewhere_run, tmp_path,
     assert sorted(p.name for p in out.iterdir()) == ["result.json", "trajectory.tum"]
 
 
+def test_stamps_in_milliseconds_are_noted(world_file, elsewhere_run, tmp_path, capsys):
+    stamps, poses = read_tum(elsewhere_run / "odometry.tum")
+    write_tum(tmp_path / "ms.tum", 1000.0 * stamps, poses)
+    given = ["-o", str(tmp_path / "out"), "--no-pictures", "--odometry", str(tmp_path / "ms.tum")]
+    main(["locate", str(world_file), str(elsewhere_run), *given])
+    assert "s from one to the next: they look like milliseconds: write seconds\n" in capsys.readouterr().err
+
+
 @pytest.mark.slow
 def test_clouds_of_identical_bytes_are_named_in_the_summary(world_file, world_run, tmp_path, capsys):
     run = tmp_path / "run"

@@ -98,7 +98,7 @@ def test_beginning_of_a_long_run_on_no_map_is_told_as_such(in_feet):
     assert sensors.found.startswith("clouds and odometry tell the same motion")
     stands = run_of([run.read(0).points] * 250, run.poses[[0] * 249 + [-1]])
     place = place_finding(stands, base_map, LocalizerConfig())
-    assert re.search(r"in the first 0 of [1-9]\d* m: ", place.found)
+    assert re.search(r"after 0 of [1-9]\d* m: ", place.found)
     assert "`locate` looks at all of the run" in place.remedy
 
 

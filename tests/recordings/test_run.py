@@ -195,12 +195,6 @@ def test_duplicate_frames_and_broken_links_are_refused(run):
         open_run(run)
 
 
-def test_stamps_in_milliseconds_are_noted(run):
-    assert open_run(run).notes == ()
-    write_tum(run / "odometry.tum", 1000.0 * (STAMPS - STAMPS[0]), POSES)
-    assert open_run(run).notes == (f"{run}: frames are 100 s apart: are the stamps in seconds?",)
-
-
 @pytest.mark.parametrize(
     "names",
     [

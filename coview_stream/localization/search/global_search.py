@@ -130,7 +130,7 @@ class GlobalSearch:
         self._scorer.clear()
         self._keyframes = 0
         self._lost: list[LostPlace | None] = []  # at the first keyframe and the newest
-        self._named: list[tuple[Hypothesis, int]] = []  # places for the next keyframe, each with its rank in the votes
+        self._named: list[tuple[int, Hypothesis]] = []  # places for the next keyframe, each by its rank in the votes
 
     def reset(self) -> None:
         """Forget all votes and observations, and the newest descriptors."""
@@ -144,13 +144,13 @@ class GlobalSearch:
             self._begin(request)
         self._lost = [*self._lost[:1], *self._lost[1:][-_NEWEST_LOST:], request.lost]
         self._scorer.area = request.area
-        self._vote(request)  # eqs 1-9: descriptors, compared with all stations at all turns
-        voted, ranks = self._propose()  # eq. 12: peaks of the consensus as T_map_odom
-        guessed = self._guessed(request)
-        voted = [*voted, *guessed, *(place for place, _ in self._named)]
-        ranks = [*ranks, *range(len(guessed)), *(rank for _, rank in self._named)]
+        for recognizer in self._recognizers:
+            recognizer.vote(request)  # eqs 1-9: descriptors, compared with all stations at all turns
+        voted = [enumerate(r.hypotheses()) for r in self._recognizers]  # propose T_map_odom: peaks (eq. 12)
+        named = [*(place for each in voted for place in each), *enumerate(self._guessed(request)), *self._named]
         hints = self._hints.due(request.hints)
-        hypotheses, scan = [*voted, *hints], self._observed(request)
+        hypotheses, scan = [*(place for _, place in named), *hints], self._observed(request)
+        ranks = [rank for rank, _ in named]
         scored = self._scorer.score(hypotheses, ranks, len(hints), scan, request.lean_prior)  # against chance
         leader = self._register(scored, scan, request)  # eq. 13, and the evidence there
         reading = Reading(request, scan, scored, leader, self._level(leader, request), self._scorer)
@@ -160,7 +160,7 @@ class GlobalSearch:
         self._note_hints(reading.scored, hints, request)
         alike = self._alike(reading)
         best = sorted(alike, key=lambda place: -place.probability)[:_NAMED]
-        self._named = [(place, int(reading.scorer.followed.votes[0])) for place in best]
+        self._named = [(int(reading.scorer.followed.votes[0]), place) for place in best]
         reading = replace(reading, scored=reading.scored.beside(alike))
         result, scored = self._decide(reading)
         if result.accepted is not None:
@@ -222,8 +222,8 @@ class GlobalSearch:
             return []
         own = ranks[rivals]
         out = reading.scorer.at_their_best(leader.T_map_odom, np.array(taken[2:]), own, scan)
-        known = zip(out, own.tolist(), strict=True)
-        self._named = [*((place, rank) for place, rank in known if place.probability > 0.0), *self._named]
+        known = zip(own.tolist(), out, strict=True)
+        self._named = [*((rank, place) for rank, place in known if place.probability > 0.0), *self._named]
         before = np.array([scored.places[k].probability for k in rivals]) / max(1.0 - scored.error, 1e-9)
         gains = np.maximum([place.probability for place in out] - before, 0.0)
         return [replace(place, probability=gain) for place, gain in zip(out, gains.tolist(), strict=True)]
@@ -290,16 +290,6 @@ class GlobalSearch:
         """Return a keyframe's scan."""
         cloud = prepare_scan(keyframe.submap, keyframe.T_odom_body[:3, 3], self.config.registration)
         return ObservedScan.of(cloud, keyframe.cloud, keyframe.T_odom_body)
-
-    def _vote(self, request: SearchRequest) -> None:
-        """Let every recognizer compare the keyframe with the map."""
-        for recognizer in self._recognizers:
-            recognizer.vote(request)
-
-    def _propose(self) -> tuple[list[Hypothesis], list[int]]:
-        """Return the hypotheses of the votes, and the rank of each in its recognizer's votes."""
-        ranked = [(place, rank) for r in self._recognizers for rank, place in enumerate(r.hypotheses())]
-        return [place for place, _ in ranked], [rank for _, rank in ranked]
 
     def _guessed(self, request: SearchRequest) -> list[Hypothesis]:
         """Return the best few poses of a guess, on the ground, whenever they are due.
