@@ -70,9 +70,9 @@ def level_of(z) -> ti.i32:
 
 
 @ti.func
-def both_bits(bits: ti.template(), at, level) -> ti.i64:
-    """Return the word of a cell, whose first word is at ``at``, shifted so that bits 0 and 32 are those of a level."""
-    return bits[at + ((level >> 5) & 1)] >> ti.cast(level & 31, ti.i64)
+def both_bits(bits: ti.template(), first, at, level) -> ti.i64:
+    """Return the word of the cell ``at``, from word ``first``, shifted so that bits 0 and 32 are those of a level."""
+    return bits[at + (at & -1024) + ((level << 5) & 1024) + first] >> ti.cast(level & 31, ti.i64)
 
 
 @ti.func
@@ -147,7 +147,7 @@ def fine_hits(
         level, rows, columns = _nine_cells(down, across, structure, p, x, y, z, yaw, step)
         for i in ti.static(range(3)):
             for j in ti.static(range(3)):
-                word = both_bits(bits, 2 * place(table, across, rows[i], columns[j]) + first, level)
+                word = both_bits(bits, first, place(table, across, rows[i], columns[j]), level)
                 hits[3 * i + j] += near_bit(word) + on_bit(word)
 
 
@@ -162,8 +162,8 @@ def closer_hits(
         # in the first and the last row and column
         cells = ti.Vector.zero(ti.i32, 4)
         for k in ti.static(range(4)):
-            at = 2 * place(table, across, rows[2 * (k // 2)], columns[2 * (k % 2)]) + first
-            word = both_bits(bits, at, level)
+            at = place(table, across, rows[2 * (k // 2)], columns[2 * (k % 2)])
+            word = both_bits(bits, first, at, level)
             cells[k] = near_bit(word) + on_bit(word)
         low = rows[1] == rows[0]
         left = columns[1] == columns[0]
@@ -188,8 +188,8 @@ def hits_at(
     hits = 0
     for p in range(structure.shape[1]):
         u, v = structure[0, p], structure[1, p]
-        at = 2 * cell_at(table, down, across, x + c * u - s * v, y + s * u + c * v) + first
-        word = both_bits(bits, at, level_of(z + structure[2, p]))
+        at = cell_at(table, down, across, x + c * u - s * v, y + s * u + c * v)
+        word = both_bits(bits, first, at, level_of(z + structure[2, p]))
         hits += near_bit(word) + on_bit(word)
     return hits
 
@@ -276,7 +276,7 @@ def score(
                         known = ti.cast(ground_of(word) != NOT_SURVEYED, ti.i32)
                         level = z + structure[2, p]
                         edge = word >> 16
-                        both = both_bits(bits, 2 * at + first, level_of(level))
+                        both = both_bits(bits, first, at, level_of(level))
                         hit = near_bit(both)
                         top = ti.select(edge > 0, base[at >> 10] + EDGE_STEP * edge, -1e6)
                         inside += known
@@ -291,14 +291,14 @@ def score(
                         level = z + low[2, p]
                         off = level - base[at >> 10] - CENTIMETRE * height
                         flat = ti.cast(ti.abs(off) < ON_GROUND, ti.i32)
-                        both = both_bits(bits, 2 * at + first, level_of(level))
+                        both = both_bits(bits, first, at, level_of(level))
                         upper = ti.cast(off > UPPER_FLOOR, ti.i32) & on_bit(both)
                         inside_low += known
                         grounded += (flat | upper) & known
                     for p in range(free.shape[1]):
                         u, v = free[0, p], free[1, p]
                         at = cell_at(table, down, across, x + c * u - s * v, y + s * u + c * v)
-                        passed += on_bit(both_bits(bits, 2 * at + first, level_of(z + free[2, p])))
+                        passed += on_bit(both_bits(bits, first, at, level_of(z + free[2, p])))
                     poses[4 * h] = x
                     poses[4 * h + 1] = y
                     poses[4 * h + 2] = z

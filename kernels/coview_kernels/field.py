@@ -151,7 +151,7 @@ class FieldMap:
         for name, kind, shape in (
             ("table", np.int32, table.shape),
             ("base", np.float32, base.shape),
-            ("words", np.int64, (tiles, TILE, TILE, 2)),
+            ("words", np.int64, (tiles, 2, TILE, TILE)),
             ("surface", np.int32, (tiles, TILE, TILE)),
             ("coarse", np.uint16, _coarse_shape(rows, columns)),
         ):
@@ -189,7 +189,7 @@ class FieldMap:
         """
         table, base = self._table()
         tiles = len(base)
-        bits = zeros("words", (tiles, TILE, TILE, 2), np.int64)
+        bits = zeros("words", (tiles, 2, TILE, TILE), np.int64)
         surface = zeros("surface", (tiles, TILE, TILE), np.int32)
         surface[:1] = NOT_SURVEYED & 0xFFFF
         for start in range(0, tiles - 1, _BATCH):
@@ -342,10 +342,10 @@ def _fill_near(bits: I64, table: I32, done: Callable[[], object]) -> None:
         on = _on(bits[table[rows, columns]])
         padded = np.zeros((len(on), TILE + 2, TILE + 2), dtype=np.uint64)
         padded[:, 1:-1, 1:-1] = on
-        padded[:, 0, 1:-1] = _on(bits[table[rows - 1, columns], -1])
-        padded[:, -1, 1:-1] = _on(bits[table[rows + 1, columns], 0])
-        padded[:, 1:-1, 0] = _on(bits[table[rows, columns - 1], :, -1])
-        padded[:, 1:-1, -1] = _on(bits[table[rows, columns + 1], :, 0])
+        padded[:, 0, 1:-1] = _on(bits[table[rows - 1, columns], :, -1])
+        padded[:, -1, 1:-1] = _on(bits[table[rows + 1, columns], :, 0])
+        padded[:, 1:-1, 0] = _on(bits[table[rows, columns - 1], :, :, -1])
+        padded[:, 1:-1, -1] = _on(bits[table[rows, columns + 1], :, :, 0])
         one, rest = np.uint64(1), np.uint64(63)
         near = on | (on << one) | (on >> rest) | (on >> one) | (on << rest)
         near |= padded[:, :-2, 1:-1] | padded[:, 2:, 1:-1] | padded[:, 1:-1, :-2] | padded[:, 1:-1, 2:]
@@ -354,14 +354,14 @@ def _fill_near(bits: I64, table: I32, done: Callable[[], object]) -> None:
 
 
 def _packed(near: U64, on: U64) -> I64:
-    """Return the words (..., 2) of :attr:`FieldLayers.words` from the bits (...) of all 64 heights."""
-    return np.stack([(near & _LOWER) | (on << _HALF), (near >> _HALF) | (on & ~_LOWER)], axis=-1).view(np.int64)
+    """Return the words (T, 2, ...) of :attr:`FieldLayers.words` from the bits (T, ...) of all 64 heights."""
+    return np.stack([(near & _LOWER) | (on << _HALF), (near >> _HALF) | (on & ~_LOWER)], axis=1).view(np.int64)
 
 
 def _on(words: I64) -> U64:
-    """Return the bits (...) on structure of all 64 heights from words (..., 2)."""
+    """Return the bits (T, ...) on structure of all 64 heights from words (T, 2, ...)."""
     both = np.ascontiguousarray(words).view(np.uint64)
-    return (both[..., 0] >> _HALF) | (both[..., 1] & ~_LOWER)
+    return (both[:, 0] >> _HALF) | (both[:, 1] & ~_LOWER)
 
 
 def _fill_coarse(planes: U16, bits: I64, table: I32, done: Callable[[], object]) -> None:

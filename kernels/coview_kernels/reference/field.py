@@ -34,7 +34,7 @@ class FieldLayers(NamedTuple):
     base: F32
     """(T + 1,) base of a tile's heights, metres."""
     words: I64
-    """(T + 1, 32, 32, 2) structure at height z, by ``32 h + k = floor(2 z) mod 64``: bit k of word h, near structure;
+    """(T + 1, 2, 32, 32) structure at height z, by ``32 h + k = floor(2 z) mod 64``: bit k of word h, near structure;
     bit k + 32, on structure."""
     surface: I32
     """(T + 1, 32, 32) ground in the lower half, centimetres; edge above it."""
@@ -138,7 +138,8 @@ def _cells(layers: FieldLayers, points: F32) -> tuple[I64, I64, I64]:
 def _near_and_on(layers: FieldLayers, cell: tuple[I64, I64, I64], z: F32) -> tuple[Mask, Mask]:
     """Return whether heights z (N,) in cells are near structure, and on structure."""
     level = np.floor(z / np.float32(CELL)).astype(np.int64) & 63
-    words = layers.words[(*cell, level >> 5)] >> (level & 31)
+    tile, row, column = cell
+    words = layers.words[tile, level >> 5, row, column] >> (level & 31)
     return (words & 1).astype(bool), (words >> 32 & 1).astype(bool)
 
 
@@ -195,12 +196,13 @@ def near_shifted(layers: FieldLayers, structure: F32, pose: F64, offsets: I64) -
     limits = np.array(layers.table.shape) * TILE - 1
     row, column = (np.clip(np.arange(first[k], last[k] + 1), 0, limits[k]) for k in range(2))
     tile = layers.table[row // TILE][:, column // TILE].astype(np.int64)
-    at = ((tile * TILE) + (row % TILE)[:, None]) * TILE + column % TILE
-    known = layers.surface.reshape(-1).take(at).astype(np.int16) != NOT_SURVEYED
-    words = np.where(known[..., None], layers.words.reshape(-1, 2).take(at, axis=0), 0).ravel()
-    width = 2 * np.array([len(column), 1])
+    at = (row % TILE)[:, None] * TILE + column % TILE
+    known = layers.surface.reshape(-1).take(tile * TILE**2 + at).astype(np.int16) != NOT_SURVEYED
+    halves = np.arange(2)[:, None, None]
+    words = np.where(known, layers.words.reshape(-1).take((2 * tile + halves) * TILE**2 + at), 0).ravel()
+    width = np.array([len(column), 1])
     level = np.floor(placed[:, 2] / np.float32(CELL)).astype(np.int64) & 63
-    index = (offsets @ width)[:, None] + (cell - first) @ width + (level >> 5)
+    index = (offsets @ width)[:, None] + (cell - first) @ width + (level >> 5) * known.size
     return np.asarray((words.take(index) >> (level & 31)) & 1, dtype=bool)
 
 
