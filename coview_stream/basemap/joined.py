@@ -32,7 +32,7 @@ from coview_stream.geometry.arrays import Floats, Ints
 JOINED_SUFFIX = ".joined"
 
 _NAMES_FORMAT = "coview-joined"
-_VERSION = 4  # in the file's name; counts changes of the files that are made of the same maps
+_VERSION = 5  # in the file's name; counts changes of the files that are made of the same maps
 
 _MIN_GAP = 300.0  # metres: a lidar's range, and a margin beyond the map's edge
 _SHARED = ("block", "voxel", "tile", "descriptor")

@@ -32,7 +32,7 @@ from coview_stream.geometry.transforms import Points
 
 log = logging.getLogger("coview_stream.maps")
 
-VERSION = 4  # in a working file's name; counts changes of the arrays that are built from the same layers
+VERSION = 5  # in a working file's name; counts changes of the arrays that are built from the same layers
 PARAMETER = "made_tiles"
 """Parameter of a working file: each tile's state, first station, station count, first field row and row count."""
 
