@@ -291,9 +291,8 @@ def score(
                         level = z + low[2, p]
                         off = level - base[at >> 10] - CENTIMETRE * height
                         flat = ti.cast(ti.abs(off) < ON_GROUND, ti.i32)
-                        above = ti.cast(off > UPPER_FLOOR, ti.i32)
-                        both = both_bits(bits, first, ti.select(above > 0, at, 0), level_of(level))
-                        upper = above & on_bit(both)
+                        above = ti.cast(off > UPPER_FLOOR, ti.i32)  # elsewhere the first word is read: it stays cached
+                        upper = above & on_bit(both_bits(bits, first, ti.select(above > 0, at, 0), level_of(level)))
                         inside_low += known
                         grounded += (flat | upper) & known
                     for p in range(free.shape[1]):

@@ -138,8 +138,7 @@ def _cells(layers: FieldLayers, points: F32) -> tuple[I64, I64, I64]:
 def _near_and_on(layers: FieldLayers, cell: tuple[I64, I64, I64], z: F32) -> tuple[Mask, Mask]:
     """Return whether heights z (N,) in cells are near structure, and on structure."""
     level = np.floor(z / np.float32(CELL)).astype(np.int64) & 63
-    tile, row, column = cell
-    words = layers.words[tile, level >> 5, row, column] >> (level & 31)
+    words = layers.words[cell[0], level >> 5, cell[1], cell[2]] >> (level & 31)
     return (words & 1).astype(bool), (words >> 32 & 1).astype(bool)
 
 
@@ -198,8 +197,7 @@ def near_shifted(layers: FieldLayers, structure: F32, pose: F64, offsets: I64) -
     tile = layers.table[row // TILE][:, column // TILE].astype(np.int64)
     at = (row % TILE)[:, None] * TILE + column % TILE
     known = layers.surface.reshape(-1).take(tile * TILE**2 + at).astype(np.int16) != NOT_SURVEYED
-    halves = np.arange(2)[:, None, None]
-    words = np.where(known, layers.words.reshape(-1).take((2 * tile + halves) * TILE**2 + at), 0).ravel()
+    words = np.where(known, [layers.words.reshape(-1).take((2 * tile + k) * TILE**2 + at) for k in range(2)], 0).ravel()
     width = np.array([len(column), 1])
     level = np.floor(placed[:, 2] / np.float32(CELL)).astype(np.int64) & 63
     index = (offsets @ width)[:, None] + (cell - first) @ width + (level >> 5) * known.size
