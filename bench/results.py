@@ -47,7 +47,7 @@ PAGE = ROOT / "docs" / "results.md"
 UNMEASURED = (
     "cli/demo.py", "cli/doctor.py", "doctor/", "report/relief.py", "stream/transport/ros2_transport.py", "viewers/",
 )  # fmt: skip
-"""Parts of the package that no figure depends on: the picture of a map, views, ROS 2, the doctor and commands."""
+"""Parts of the package that no benchmark runs: the picture of a map, views, ROS 2, the demo and the doctor."""
 
 
 class Table(NamedTuple):

@@ -83,8 +83,8 @@ def run(args: argparse.Namespace) -> int:
     print(table(evaluation))
     if located.reason:
         print(f"{'reason':<18} {located.reason}")
-    elif located.late:
-        print(f"{'machine':<18} busy: {located.late}; demo --offline waits for each frame")
+    if located.dropped:
+        print(f"{'busy':<18} {located.dropped}; `coview-stream demo --offline` waits for each frame")
     names = ("site.coview", "world", *([] if args.offline else ["logs"]), *_WRITTEN)
     print(f"{'written':<18} {out}: {', '.join(name for name in names if (out / name).exists())}")
     print(f"{'step by step':<18} coview-stream build {world / 'base.laz'} -o site.coview")

@@ -102,7 +102,7 @@ def _findings(args: argparse.Namespace, keys: list[RobotKeys]) -> Iterator[Findi
     from coview_stream.doctor.finding import Finding, from_error
     from coview_stream.doctor.machine_checks import machine_findings, memory
     from coview_stream.doctor.map_checks import map_findings, open_map, run_findings
-    from coview_stream.recordings.open_run import open_run
+    from coview_stream.recordings.open_run import STAMPS, open_run
     from coview_stream.stream.transport.zenoh_config import compose
     from coview_stream.stream.transport.zenoh_transport import DEFAULT_ENDPOINT
 
@@ -137,7 +137,7 @@ def _findings(args: argparse.Namespace, keys: list[RobotKeys]) -> Iterator[Findi
             yield from_error("run", error)
         else:
             notes = (note.removeprefix(f"{recorded.path}: ") for note in recorded.notes)
-            yield from (Finding("ok", "recording", note) for note in notes)
+            yield from (Finding("ok", "recording", note) for note in notes if not note.startswith(STAMPS))
             config = LocalizerConfig(cloud_delay=args.cloud_delay or 0.0)
             drawn = sys.stderr.isatty() and importlib.util.find_spec("tqdm") is not None
             with progress_bar("judging", unit="frame") if drawn else nullcontext() as follow:

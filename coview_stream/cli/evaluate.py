@@ -54,10 +54,13 @@ def run(args: argparse.Namespace) -> int:
 
 def table(evaluation: Evaluation) -> str:
     """Return the evaluation as lines of names and values."""
+    from coview_stream.report.evaluation import MIN_RIGHT_SHARE
+
     first = "never" if evaluation.first_fix_m is None else f"after {evaluation.first_fix_m:.1f} m"
-    failure = "no: the first pose or 5 % of all are wrong" if evaluation.posed else "no: no pose"
+    few = evaluation.false_frames < (1.0 - MIN_RIGHT_SHARE) * evaluation.posed
+    failure = "the first pose is wrong" if few else f"{1.0 - MIN_RIGHT_SHARE:.0%} of the poses or more are wrong"
     rows = [
-        ("success", "yes" if evaluation.success else failure),
+        ("success", "yes" if evaluation.success else f"no: {failure if evaluation.posed else 'no pose'}"),
         ("localized", f"{evaluation.share_localised:.1%} of {counted(evaluation.frames, 'frame')}"),
         ("false frames", f"{evaluation.false_frames} of {counted(evaluation.posed, 'pose')}"),
         ("first pose", first),

@@ -43,7 +43,6 @@ def run(args: argparse.Namespace) -> int:
     from coview_stream.basemap.basemap import BaseMap
     from coview_stream.clouds.progress import progress_bar
     from coview_stream.config import LocalizerConfig
-    from coview_stream.doctor.map_checks import stamps_finding
     from coview_stream.errors import InputError
     from coview_stream.localization.offline import DESCRIPTORS_PNG, FILTERED, TRAJECTORY_PNG, locate, summary, write
     from coview_stream.odometry.lidar_odometry import LidarOdometry
@@ -76,9 +75,6 @@ def run(args: argparse.Namespace) -> int:
         recorded = open_run(args.run_path, args.odometry, args.cloud_topic, args.odometry_topic, lidar, follow, mount)
     for note in recorded.notes:
         print(note, file=sys.stderr)
-    stamps = stamps_finding(recorded)
-    if stamps.verdict == "FAIL":
-        print(f"{args.run_path}: {stamps.found}: {stamps.remedy}", file=sys.stderr)
     config = replace(config, reloc=args.reloc if missing is None else "coview")
     with progress_bar("locating", shown, "frame") as bar:
         located = locate(

@@ -111,7 +111,7 @@ class RunResult:
         smoothed: poses by the whole run, in order; None unless requested.
         considered: places of the newest search, if no frame has a pose; else None.
         node_reason: why there was no pose, as reported by a node; empty without a node.
-        late: clause on the work that a node's machine had no time for; empty if there was none.
+        dropped: clause on the work that a node's machine had no time for; empty if there was none.
     """
 
     frames: int
@@ -127,7 +127,7 @@ class RunResult:
     smoothed: list[SmoothedPose] | None = None
     considered: Considered | None = None
     node_reason: str = ""
-    late: str = ""
+    dropped: str = ""
 
     @property
     def reason(self) -> str:
@@ -341,12 +341,12 @@ def from_stream(
             if not located.keyframes or located.keyframes[-1].stamp != evidence.stamp:
                 located.keyframes.append(evidence)
     if live := [status for status in statuses if "counters" in status and not status["node"]["ending"]]:
-        located.late = _late(live[-1]["counters"], len(stamps))
-        located.node_reason = "; ".join(part for part in (located.late, live[-1]["reason"]) if part)
+        located.dropped = _dropped(live[-1]["counters"], len(stamps))
+        located.node_reason = "; ".join(part for part in (located.dropped, live[-1]["reason"]) if part)
     return located
 
 
-def _late(counters: dict[str, int], frames: int) -> str:
+def _dropped(counters: dict[str, int], frames: int) -> str:
     """Return a clause on the work that a node's machine dropped for lack of time; empty if there was none."""
     searches = counters["searches"] + counters["searches_skipped"]
     parts = [
@@ -427,7 +427,7 @@ def _trajectory(posed: Sequence[Fix] | Sequence[SmoothedPose]) -> tuple[Floats, 
 
 def _usual_reason(gap: Sequence[Fix]) -> str:
     """Return the newest reason that has the most frequent cause: at first the cause may not be clear."""
-    unsaid = {state: "the node published no pose" if state.has_place else state.reported for state in State}
+    unsaid = {state: "no pose arrived" if state is State.TRACKING else state.reported for state in State}
     reasons = [(unsaid[fix.state], None) if (e := fix.evidence) is None else (e.reason, e.cause) for fix in gap]
     cause = Counter(cause for _, cause in reasons).most_common(1)[0][0]
     return next(reason for reason, other in reversed(reasons) if other is cause)

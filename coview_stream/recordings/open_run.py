@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -16,6 +17,9 @@ if TYPE_CHECKING:
     from coview_stream.odometry.lidar_odometry import LidarOdometry
     from coview_stream.recordings.lidar_runs import Progress
 
+
+STAMPS = "stamps look like "
+"""How a note begins that doubts the unit of the stamps."""
 
 KISS_ICP = "kiss-icp"
 """Instead of an odometry file: compute odometry from the clouds."""
@@ -84,4 +88,6 @@ def open_run(
             "(t x y z qx qy qz qw per frame) or name a file, or make it of the clouds: --odometry kiss-icp"
         )
     stamps, poses = read_odometry(layout, explicit)
-    return Run(path, layout.frames, stamps, poses, mount=mount)
+    run = Run(path, layout.frames, stamps, poses, mount=mount)
+    told = f"{path}: {STAMPS}{run.stamp_unit}, {run.interval:.4g} from one frame to the next; write seconds"
+    return run if run.stamp_unit == "seconds" else replace(run, notes=(told,))

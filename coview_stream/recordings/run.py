@@ -94,6 +94,17 @@ class Run:
     def __len__(self) -> int:
         return len(self.frames_paths)
 
+    @property
+    def interval(self) -> float:
+        """Median time from one frame to the next, seconds; NaN of a single frame."""
+        return float(np.median(np.diff(self.stamps))) if len(self) > 1 else float("nan")
+
+    @property
+    def stamp_unit(self) -> str:
+        """Unit that the stamps seem to have; seconds, unless ten milliseconds or more, as numbers, lie between them."""
+        units = ((1e9, "nanoseconds"), (1e6, "microseconds"), (1e3, "milliseconds"))
+        return next((name for factor, name in units if self.interval > factor * 1e-2), "seconds")
+
     def __iter__(self) -> Iterator[Frame]:
         """Yield every frame in order; raises like ``read``, so use ``read`` to skip a damaged frame."""
         return (self.read(index) for index in range(len(self)))

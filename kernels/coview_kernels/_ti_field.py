@@ -71,7 +71,8 @@ def level_of(z) -> ti.i32:
 
 @ti.func
 def both_bits(bits: ti.template(), first, at, level) -> ti.i64:
-    """Return the word of the cell ``at``, from word ``first``, shifted so that bits 0 and 32 are those of a level."""
+    """Return the word of a cell, shifted so that bits 0 and 32 are those of a level; ``first``: see above."""
+    # a tile has 1024 cells, and as many words of the lower half of its 64 levels, then as many of the upper half
     return bits[at + (at & -1024) + ((level << 5) & 1024) + first] >> ti.cast(level & 31, ti.i64)
 
 
@@ -291,7 +292,7 @@ def score(
                         level = z + low[2, p]
                         off = level - base[at >> 10] - CENTIMETRE * height
                         flat = ti.cast(ti.abs(off) < ON_GROUND, ti.i32)
-                        above = ti.cast(off > UPPER_FLOOR, ti.i32)  # elsewhere the first word is read: it stays cached
+                        above = ti.cast(off > UPPER_FLOOR, ti.i32) & known  # else words of the empty tile: cached
                         upper = above & on_bit(both_bits(bits, first, ti.select(above > 0, at, 0), level_of(level)))
                         inside_low += known
                         grounded += (flat | upper) & known

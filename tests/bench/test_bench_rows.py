@@ -54,7 +54,10 @@ def test_a_result_is_reused_for_the_same_spec_only(tmp_path):
     assert len({fingerprint(part) if part else fingerprint() for part in parts}) == len(parts)
     every = fingerprint(), fingerprint(without=results.UNMEASURED), fingerprint(without=("no such file",))
     assert every[0] == every[2] != every[1]
-    assert all((Path(coview_stream.__file__).parent / name).exists() for name in results.UNMEASURED)
+    package = Path(coview_stream.__file__).parent
+    assert all((package / name).exists() for name in results.UNMEASURED)
+    files = [path for path in package.rglob("*.py") if "coview_stream.doctor" in path.read_text(encoding="utf-8")]
+    assert all(str(path.relative_to(package)).startswith(results.UNMEASURED) for path in files)
 
 
 def test_prose_does_not_change_the_hash_of_code():

@@ -72,7 +72,8 @@ def test_stamps_in_milliseconds_are_noted(world_file, elsewhere_run, tmp_path, c
     write_tum(tmp_path / "ms.tum", 1000.0 * stamps, poses)
     given = ["-o", str(tmp_path / "out"), "--no-pictures", "--odometry", str(tmp_path / "ms.tum")]
     main(["locate", str(world_file), str(elsewhere_run), *given])
-    assert "s from one to the next: they look like milliseconds: write seconds\n" in capsys.readouterr().err
+    err = capsys.readouterr().err
+    assert err == f"{elsewhere_run}: stamps look like milliseconds, 500 from one frame to the next; write seconds\n"
 
 
 @pytest.mark.slow

@@ -13,7 +13,7 @@ import coview_kernels as kernels
 from coview_kernels import reference
 from coview_kernels.field import FieldKernel, FieldMap, FieldScan
 from coview_kernels.mapped import Windows
-from coview_kernels.reference.field import NO_GROUND, TILE, FieldLayers, Plan
+from coview_kernels.reference.field import NO_GROUND, NOT_SURVEYED, TILE, FieldLayers, Plan
 
 Scene = tuple[FieldMap, FieldScan, np.ndarray, np.ndarray]
 
@@ -119,6 +119,22 @@ def test_structure_counts_at_all_64_levels_and_at_the_six_neighbours():
         found = kernels.field_scores(field, scan, [[0.0, 0.0, shift, 0.0]], kernels.Move.NONE)
         on, close = (int(mask[tuple(at[rows].T)].sum()) for mask in (cells, near))
         assert (found.on[0], found.near[0], found.passed[0]) == (on, close, on)
+        beside = kernels.near_structure(field, points[rows], [0.0, 0.0, shift, 0.0], [[0.0, 0.0], [0.5, 0.0]])
+        moved = np.pad(near[:, 1:], ((0, 0), (0, 1), (0, 0)))
+        assert beside.sum(axis=1).tolist() == [close, moved[tuple(at[rows].T)].sum()]
+
+
+def test_floor_above_the_lowest_surface_is_ground_where_the_map_has_points():
+    occupied = np.zeros((1, TILE, TILE), dtype=np.int64)
+    ground, edge = np.zeros((1, TILE, TILE), dtype=np.int16), np.zeros((1, TILE, TILE), dtype=np.uint8)
+    occupied[0, 5, 5:8], ground[0, 5, 6], ground[0, 5, 7] = 1 << 6, NO_GROUND, NOT_SURVEYED
+    field = FieldMap(np.zeros((1, 3), np.int32), occupied, ground, edge)
+    low = np.array([[x, 2.6, z] for x, z in ((2.6, 3.1), (3.1, 3.1), (3.6, 3.1), (4.1, 3.1), (2.6, 0.1), (2.6, 1.0))])
+    scan = FieldScan(low[:0].astype(np.float32), low.astype(np.float32), low[:0].astype(np.float32))
+    found = kernels.field_scores(field, scan, np.zeros((1, 4)), kernels.Move.NONE)
+    corner = np.array([*field.corner[::-1] * 16.0, 0.0, 0.0])
+    twin = reference.field_scores(field.layers, Plan(*scan.parts, -1, False), np.zeros((1, 4)) - corner)[1][0]
+    assert (found.low[0], found.grounded[0]) == (twin[3], twin[4]) == (5, 3)
 
 
 def test_one_map_scores_one_scan_after_another(scene: Scene):
@@ -238,7 +254,7 @@ def test_tiles_beyond_what_32_bits_count_are_looked_up(scene: Scene, tmp_path: P
     large = layers._replace(table=number.astype(np.int32), **sparse)
     assert large.words.size > 2**31
     corner = np.array([*field.corner[::-1] * 16.0, 0.0, 0.0])
-    starts = np.vstack([others, pose]) - corner
+    starts = np.vstack([others, pose, pose + np.array([0.0, 0.0, 16.0, 0.0])]) - corner  # upper words, too
     plan = Plan(*scan.parts, 2, True)
 
     def scores(each: FieldLayers) -> tuple[np.ndarray, np.ndarray]:

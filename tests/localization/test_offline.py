@@ -217,5 +217,5 @@ def test_run_without_a_pose_has_the_nodes_last_reason_and_the_work_that_it_had_n
     tracked = [busy[0] | {"state": "TRACKING", "last_frame_ns": 100_000_000}, end]
     pose = {"stamp_ns": 0, "position": [0, 0, 0], "orientation": [0, 0, 0, 1], "covariance": [0] * 36, "confidence": 1}
     located = from_stream([0.0, 0.1], [pose], tracked)
-    assert [gap.reason for gap in located.interruptions] == ["the node published no pose"]
-    assert (located.late, located.reason) == (late, "")
+    assert [gap.reason for gap in located.interruptions] == ["no pose arrived"]
+    assert (located.dropped, located.reason) == (late, "")

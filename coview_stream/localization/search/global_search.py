@@ -130,7 +130,7 @@ class GlobalSearch:
         self._scorer.clear()
         self._keyframes = 0
         self._lost: list[LostPlace | None] = []  # at the first keyframe and the newest
-        self._named: list[tuple[int, Hypothesis]] = []  # places for the next keyframe, each by its rank in the votes
+        self._named: list[tuple[int, Hypothesis]] = []  # places for the next keyframe, each after its rank in the votes
 
     def reset(self) -> None:
         """Forget all votes and observations, and the newest descriptors."""

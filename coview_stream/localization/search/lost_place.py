@@ -75,10 +75,11 @@ def _by_path(
     at: Poses, gaps: Floats, lost: LostPlace, begin: LostPlace | None, registered: Floats, scorer: PlaceScorer,
     nearest: float,
 ) -> tuple[Floats, Floats, Floats]:  # fmt: skip
-    """Return :func:`_by_drift` of places (P, 4, 4) ``at``, and squared distances (P,) of the drift since ``begin``.
+    """Return :func:`_by_drift` of places (P, 4, 4) ``at``, and squared distances (P,) by growth since ``begin``.
 
-    ``gaps`` (P, 6) are the places' distances from the path's newest end, ``registered`` (6, 6) the covariance of one.
-    Places within the squared distance ``nearest`` are compared at the first keyframe; the others came by a slip.
+    ``gaps`` (P, 6) are those to the path's newest end, ``registered`` (6, 6) is the covariance of a registered pose.
+    Places within the squared distance ``nearest`` are compared at the first keyframe, the others at the newest, as all
+    are without ``begin``.
     """
     spread = lost.covariance + registered + np.diag([0.0, 0.0, 0.0, 0.0, 0.0, _HEIGHT**2])
     there, distance = _by_drift(gaps, spread)
