@@ -9,6 +9,7 @@ import argparse
 import contextlib
 import json
 import queue
+import shutil
 import signal
 import socket
 import subprocess
@@ -84,12 +85,13 @@ def run(args: argparse.Namespace) -> int:
     if located.reason:
         print(f"{'reason':<18} {located.reason}")
     if located.dropped:
-        print(f"{'busy':<18} {located.dropped}; `coview-stream demo --offline` waits for each frame")
+        print(f"{'busy':<18} {located.dropped}; odometry carries the pose over some; try demo --offline")
+    command = "coview-stream" if shutil.which("coview-stream") else sys.argv[0]  # outside its environment
     names = ("site.coview", "world", *([] if args.offline else ["logs"]), *_WRITTEN)
     print(f"{'written':<18} {out}: {', '.join(name for name in names if (out / name).exists())}")
-    print(f"{'step by step':<18} coview-stream build {world / 'base.laz'} -o site.coview")
-    print(f"{'':<18} coview-stream locate site.coview {world / 'run'} -o out")
-    print(f"{'':<18} coview-stream eval out/trajectory.tum {world / 'truth.tum'}")
+    print(f"{'step by step':<18} {command} build {world / 'base.laz'} -o site.coview")
+    print(f"{'':<18} {command} locate site.coview {world / 'run'} -o out")
+    print(f"{'':<18} {command} eval out/trajectory.tum {world / 'truth.tum'}")
     return 0 if evaluation.success else 1
 
 

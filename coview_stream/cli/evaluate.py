@@ -58,7 +58,7 @@ def table(evaluation: Evaluation) -> str:
 
     first = "never" if evaluation.first_fix_m is None else f"after {evaluation.first_fix_m:.1f} m"
     few = evaluation.false_frames < (1.0 - MIN_RIGHT_SHARE) * evaluation.posed
-    failure = "the first pose is wrong" if few else f"{1.0 - MIN_RIGHT_SHARE:.0%} of the poses or more are wrong"
+    failure = "the first pose is wrong" if few else f"{evaluation.false_frames} of {evaluation.posed} poses are wrong"
     rows = [
         ("success", "yes" if evaluation.success else f"no: {failure if evaluation.posed else 'no pose'}"),
         ("localized", f"{evaluation.share_localised:.1%} of {counted(evaluation.frames, 'frame')}"),

@@ -129,10 +129,10 @@ def constant_offset(estimate: Trajectory, truth: Trajectory) -> str | None:
     _, T_est, T_true = _pairs(estimate, truth)
     apart = T_true[:, :3, 3] - T_est[:, :3, 3]
     of_body = np.einsum("nji,nj->ni", T_est[:, :3, :3], apart)
-    for each, name in ((apart, "another origin of the map's frame"), (of_body, "another place on the body")):
+    for each, name in ((apart, "do the origins differ"), (of_body, "do the places on the body differ")):
         shift = np.median(each, axis=0)
         if (np.linalg.norm(each - shift, axis=1) < MAX_TRANSLATION / 3.0).mean() > MIN_RIGHT_SHARE:
-            return f"lies {', '.join(f'{s:.2f}' for s in shift)} m from the estimate all along: is it of {name}?"
+            return f"lies {', '.join(f'{s:.2f}' for s in shift)} m from the estimate all along: {name}?"
     turn = Rotation.from_matrix(T_true[:, :3, :3] @ T_est[:, :3, :3].transpose(0, 2, 1)).mean()
     apart = T_true[:, :3, 3] - turn.apply(T_est[:, :3, 3])
     if (np.linalg.norm(apart - np.median(apart, axis=0), axis=1) < MAX_TRANSLATION).mean() > MIN_RIGHT_SHARE:
