@@ -11,6 +11,7 @@ from coview_kernels import Move
 from coview_stream.basemap.basemap import BaseMap
 from coview_stream.config import Channel, LocalizerConfig
 from coview_stream.descriptors.coview import Descriptor, on_ground
+from coview_stream.geometry.arrays import Floats
 from coview_stream.geometry.transforms import Pose, pose_from, rot_z, tilt_of, yaw_of
 from coview_stream.localization.calibration.calibration import lean_prior
 from coview_stream.localization.evidence.moved_part import find_moved_part
@@ -19,7 +20,7 @@ from coview_stream.localization.registration.clouds import LocalMaps, prepare_sc
 from coview_stream.localization.search.acceptance import Considered, SearchResult, decide
 from coview_stream.localization.search.consensus import Hypothesis
 from coview_stream.localization.search.hints import HintSchedule, on_the_ground, robot_position
-from coview_stream.localization.search.lost_place import weighed_by_odometry
+from coview_stream.localization.search.lost_place import log_priors, weighed_by_odometry
 from coview_stream.localization.search.places import BASIN_ANGLE, BASIN_DISTANCE, Scored
 from coview_stream.localization.search.recognizers import CoViewRecognizer, PlaceRecognizer, SearchIndex
 from coview_stream.localization.search.refinement import find_modes, levelled_by_frame, register_place
@@ -178,9 +179,13 @@ class GlobalSearch:
             context = request, scans, self.base_map, self.config, reading.scorer, begin
             if weighed_by_odometry(scored, leader, *context).error < self.config.acceptance.risk:
                 place = scored.places[0]
-                modes = find_modes(
-                    place, leader, scan, request, self.base_map, self.config, self._local_maps, reading.scorer.beside
-                )
+                registered = leader
+
+                def beside(poses: Floats) -> Floats:
+                    by_path = log_priors(poses, registered, request, self.config, reading.scorer, begin)
+                    return reading.scorer.beside(poses) + by_path
+
+                modes = find_modes(place, leader, scan, request, self.base_map, self.config, self._local_maps, beside)
                 leader, undecided = modes.best, modes.undecided
                 if not undecided:
                     scored = scored.beside(self._registered_rivals(replace(reading, scored=scored), leader))

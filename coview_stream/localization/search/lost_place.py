@@ -12,6 +12,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from typing import NamedTuple
 
 import numpy as np
 
@@ -47,57 +48,78 @@ def weighed_by_odometry(
     lost = request.lost
     if lost is None or leader.registration is None:
         return scored
-    end = lost.T_map_odom @ request.T_odom_body
     at = [leader.T_map_odom, *(place.T_map_odom for place in scored.places[1:])]
-    gaps = np.array([boxminus(end, T @ request.T_odom_body) for T in at])
     registered = registration_covariance(leader.registration.information, config.registration)
-    nearest = chi2_quantile(len(_LEVEL), config.acceptance.risk)
-    there, distance, since = _by_path(np.stack(at), gaps, lost, begin, registered, scorer, nearest)
-    slipped = lost.odds if begin is None else min(begin.odds, lost.odds)  # by the first keyframe
-    along = np.exp(-0.5 * since)
-    density = along * there * np.exp(-0.5 * distance)
+    path = _by_path(np.stack(at), registered, request, lost, config, scorer, begin)
     first = np.array([k == 0 or same_place(T, at[0], request, BASIN_DISTANCE, BASIN_ANGLE) for k, T in enumerate(at)])
-    scored = scored.weighed(np.minimum(density, 1.0) / lost.odds, first)
-    metres, radians = np.linalg.norm(gaps[:, 3:], axis=1), np.abs(gaps[:, 2])
+    scored = scored.weighed(np.minimum(path.density, 1.0) / lost.odds, first)
+    metres, radians = np.linalg.norm(path.gaps[:, 3:], axis=1), np.abs(path.gaps[:, 2])
     at_end = (metres <= 0.5 * ALERT_METRES) & (radians <= math.radians(0.5 * ALERT_DEGREES))
     if at_end[0]:
         return scored  # both may be right
     right = log_odds_of_moved(base_map.field, scans, at[0], lost.T_map_odom)
-    apart = distance[0] + since[0] > nearest  # else both are modes of one place
+    apart = path.squared[0] > chi2_quantile(len(_LEVEL), config.acceptance.risk)  # else both are modes of one place
     if apart and not (at_end & ~first).any():  # it is not weighed yet
         here, beside = scorer.beside(np.stack([at[0], lost.T_map_odom]))
-        right = float(np.logaddexp(right, math.log(there[0]) + beside - here))
-    odds = math.exp(min(right, 100.0)) / (density[0] + along[0] * slipped + lost.odds - slipped)
+        right = float(np.logaddexp(right, math.log(path.there[0]) + beside - here))
+    odds = math.exp(min(right, 100.0)) / path.prior[0]
     return scored.beside([Hypothesis(lost.T_map_odom, probability=float(odds))])
 
 
-def _by_path(
-    at: Poses, gaps: Floats, lost: LostPlace, begin: LostPlace | None, registered: Floats, scorer: PlaceScorer,
-    nearest: float,
-) -> tuple[Floats, Floats, Floats]:  # fmt: skip
-    """Return :func:`_by_drift` of places (P, 4, 4) ``at``, and squared distances (P,) by growth since ``begin``.
+def log_priors(
+    T_map_odom: Poses, leader: Hypothesis, request: SearchRequest, config: LocalizerConfig, scorer: PlaceScorer,
+    begin: LostPlace | None = None,
+) -> Floats:  # fmt: skip
+    """Return log-priors (M,) of modes (M, 4, 4) of the registered ``leader``'s place; zeros if no place was lost.
 
-    ``gaps`` (P, 6) are those to the path's newest end, ``registered`` (6, 6) is the covariance of a registered pose.
-    Places within the squared distance ``nearest`` are compared at the first keyframe, the others at the newest, as all
-    are without ``begin``.
+    A moved building beside the end of odometry's path may fit better than the truth by a few nats.
     """
+    if request.lost is None or leader.registration is None:
+        return np.zeros(len(T_map_odom))
+    registered = registration_covariance(leader.registration.information, config.registration)
+    return np.log(_by_path(T_map_odom, registered, request, request.lost, config, scorer, begin).prior)
+
+
+class _Path(NamedTuple):
+    """Comparison of P places with odometry's path; densities in the unit of :func:`_by_drift`."""
+
+    gaps: Floats  # (P, 6) from the path's newest end
+    squared: Floats  # (P,) distances in units of the drift, squared
+    there: Floats  # (P,) density of the drift at no gap
+    density: Floats  # (P,) of the drift
+    prior: Floats  # (P,) density of the drift or a slip
+
+
+def _by_path(
+    at: Poses, registered: Floats, request: SearchRequest, lost: LostPlace, config: LocalizerConfig,
+    scorer: PlaceScorer, begin: LostPlace | None,
+) -> _Path:  # fmt: skip
+    """Compare places (P, 4, 4) with odometry's path; ``registered`` (6, 6) is the covariance of a registered pose.
+
+    Places within the drift are compared at the first keyframe, where ``begin`` is the lost place, and by the growth of
+    their gaps since; the others at the newest, as all are without ``begin``.
+    """
+    end = lost.T_map_odom @ request.T_odom_body
+    gaps = np.array([boxminus(end, T @ request.T_odom_body) for T in at])
     spread = lost.covariance + registered + np.diag([0.0, 0.0, 0.0, 0.0, 0.0, _HEIGHT**2])
     there, distance = _by_drift(gaps, spread)
-    near, since = distance <= nearest, np.zeros(len(at))
-    if begin is None or not near.any():
-        return there, distance, since
-    T_odom_first, path = scorer.look_back(at[near])
-    gap = (begin.T_map_odom @ T_odom_first)[:2, 3] - path[:, :2]
-    scatter = registered[3:5, 3:5] + SCATTER**2 * np.eye(2)
-    size, axes = np.linalg.eigh((lost.covariance - begin.covariance)[3:5, 3:5])  # a way back unwinds drift
-    grown = scatter + (axes * np.maximum(size, 0.0)) @ axes.T
-    later = gaps[near, 3:5] - gap
-    since[near] = np.minimum(np.einsum("ki,ki->k", later, np.linalg.solve(grown, later.T).T), _FAR)
-    first = gaps[near]
-    spread[3:5], spread[:, 3:5], first[:, 3:5] = 0.0, 0.0, gap
-    spread[3:5, 3:5] = begin.covariance[3:5, 3:5] + scatter
-    there[near], distance[near] = _by_drift(first, spread)
-    return there, distance, since
+    near, since = distance <= chi2_quantile(len(_LEVEL), config.acceptance.risk), np.zeros(len(at))
+    slipped = lost.odds if begin is None else min(begin.odds, lost.odds)  # by the first keyframe
+    if begin is not None and near.any():
+        T_odom_first, path = scorer.look_back(at[near])
+        gap = (begin.T_map_odom @ T_odom_first)[:2, 3] - path[:, :2]
+        scatter = registered[3:5, 3:5] + SCATTER**2 * np.eye(2)
+        size, axes = np.linalg.eigh((lost.covariance - begin.covariance)[3:5, 3:5])  # a way back unwinds drift
+        grown = scatter + (axes * np.maximum(size, 0.0)) @ axes.T
+        later = gaps[near, 3:5] - gap
+        since[near] = np.minimum(np.einsum("ki,ki->k", later, np.linalg.solve(grown, later.T).T), _FAR)
+        first = gaps[near]
+        spread[3:5], spread[:, 3:5], first[:, 3:5] = 0.0, 0.0, gap
+        spread[3:5, 3:5] = begin.covariance[3:5, 3:5] + scatter
+        there[near], distance[near] = _by_drift(first, spread)
+    along = np.exp(-0.5 * since)
+    density = along * there * np.exp(-0.5 * distance)
+    return _Path(gaps, distance + since, there, density, density + along * slipped + lost.odds - slipped)
 
 
 def _by_drift(gaps: Floats, spread: Floats) -> tuple[Floats, Floats]:

@@ -10,7 +10,7 @@ from trackers import observed
 
 from coview_stream.config import LocalizerConfig
 from coview_stream.geometry.transforms import inverse, pose_from, rot_z
-from coview_stream.localization.search.lost_place import weighed_by_odometry
+from coview_stream.localization.search.lost_place import log_priors, weighed_by_odometry
 from coview_stream.localization.search.places import Scored
 from coview_stream.localization.search.request import EarlierKeyframe, LostPlace
 from coview_stream.localization.state import State
@@ -89,6 +89,18 @@ def test_path_that_leads_beside_it_contradicts_it_unless_odometry_went_wrong(wor
 def test_path_that_drifts_as_far_does_not_contradict_it(world_map, request_):
     result = searching(world_map).update(lost(request_, 1.5, 1e-3, sigma=1.0))
     assert result.evidence.state is State.TRACKING
+
+
+def test_modes_of_a_place_have_the_prior_of_the_path(request_):
+    modes = np.stack([T_MAP_ODOM, pose_from(np.eye(3), [1.0, 0.0, 0.0]) @ T_MAP_ODOM])
+    leader, scorer = candidate(place(0.9, T_MAP_ODOM)), Silent(request_)
+    assert log_priors(modes, leader, request_, LocalizerConfig(), scorer).tolist() == [0.0, 0.0]
+    for metres, sigma, ahead in ((0.0, 0.1, 0), (1.0, 0.1, 1), (0.5, 0.1, None), (0.0, 5.0, None)):
+        by_path = log_priors(modes, leader, lost(request_, metres, 1e-3, sigma), LocalizerConfig(), scorer)
+        if ahead is None:
+            assert abs(by_path[0] - by_path[1]) < 0.1
+        else:
+            assert by_path[ahead] - by_path[1 - ahead] > 5.0  # more than a moved building may seem to fit better
 
 
 def test_drift_has_to_explain_the_distance_at_the_first_keyframe(world_map, world_drive, request_):
