@@ -171,7 +171,7 @@ class GlobalSearch:
     def _decide(self, reading: Reading) -> tuple[SearchResult, Scored]:
         """Decide on a keyframe's first place by its rivals along the street, its modes, and moved parts."""
         request, scan, scored, leader = reading.request, reading.scan, reading.scored, reading.leader
-        undecided = 0.0
+        undecided, aside = 0.0, list[Hypothesis]()
         if leader is not None:
             scored = self._gathered(scored, leader, scan, request)
             scans = [scan] if reading.leans else [*self._scorer.scans[:-1], scan]
@@ -187,9 +187,10 @@ class GlobalSearch:
 
                 modes = find_modes(place, leader, scan, request, self.base_map, self.config, self._local_maps, beside)
                 leader, undecided = modes.best, modes.undecided
+                aside = modes.distant if request.lost is not None else []  # a slip, or a moved building
                 if not undecided:
                     scored = scored.beside(self._registered_rivals(replace(reading, scored=scored), leader))
-            scored = weighed_by_odometry(scored, leader, *context)  # may be another pose than before
+            scored = weighed_by_odometry(scored, leader, *context).beside(aside)  # may be another pose than before
             if scored.error < 0.5:  # a stated error has to be true even if nothing follows from it
                 scored = scored.doubted(find_moved_part(self.base_map.field, scans, leader.T_map_odom))
         result = decide(scored, leader, request, self.config.acceptance, undecided)

@@ -70,9 +70,9 @@ def log_priors(
     T_map_odom: Poses, leader: Hypothesis, request: SearchRequest, config: LocalizerConfig, scorer: PlaceScorer,
     begin: LostPlace | None = None,
 ) -> Floats:  # fmt: skip
-    """Return log-priors (M,) of modes (M, 4, 4) of the registered ``leader``'s place; zeros if no place was lost.
+    """Return log-priors (M,) of modes (M, 4, 4) of the registered ``leader``'s place, up to a constant.
 
-    A moved building beside the end of odometry's path may fit better than the truth by a few nats.
+    They are zeros if no place was lost. Without them, a moved building beside odometry's path might win by a few nats.
     """
     if request.lost is None or leader.registration is None:
         return np.zeros(len(T_map_odom))
@@ -119,7 +119,7 @@ def _by_path(
         there[near], distance[near] = _by_drift(first, spread)
     along = np.exp(-0.5 * since)
     density = along * there * np.exp(-0.5 * distance)
-    return _Path(gaps, distance + since, there, density, density + along * slipped + lost.odds - slipped)
+    return _Path(gaps, distance + since, there, density, density + along * slipped + (lost.odds - slipped))
 
 
 def _by_drift(gaps: Floats, spread: Floats) -> tuple[Floats, Floats]:

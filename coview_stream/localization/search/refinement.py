@@ -16,7 +16,7 @@ from coview_kernels import Prior
 from coview_stream.basemap.basemap import BaseMap
 from coview_stream.config import LocalizerConfig, RegistrationConfig
 from coview_stream.config.localizer import MIN_PAIRS
-from coview_stream.geometry.arrays import Floats
+from coview_stream.geometry.arrays import Bools, Floats
 from coview_stream.geometry.protection import ALERT_METRES
 from coview_stream.geometry.transforms import (
     Pose,
@@ -54,11 +54,22 @@ class Modes:
     best: Hypothesis  # the most probable mode
     distances: Floats  # (M,) metres from the best mode
     probabilities: Floats  # (M,) add up to one
+    places: list[Hypothesis]  # the modes
+
+    @property
+    def distant(self) -> list[Hypothesis]:
+        """Distant modes; their ``probability`` is their odds against the best mode."""
+        odds = self.probabilities / self.probabilities[0]
+        return [replace(self.places[k], probability=float(odds[k])) for k in np.flatnonzero(self._elsewhere)]
+
+    @property
+    def _elsewhere(self) -> Bools:
+        return self.distances > 0.5 * ALERT_METRES
 
     @property
     def undecided(self) -> float:
         """Metres to the most probable distant mode, if the distant modes together exceed one half; else 0."""
-        elsewhere = self.distances > 0.5 * ALERT_METRES
+        elsewhere = self._elsewhere
         if self.probabilities[elsewhere].sum() < 0.5:
             return 0.0
         return float(self.distances[elsewhere][self.probabilities[elsewhere].argmax()])
@@ -113,7 +124,7 @@ def find_modes(
 ) -> Modes:  # fmt: skip
     """Register a scan from poses around ``leader``, the registered ``place``, and weight the results within it.
 
-    ``beside`` returns the evidence of poses by the keyframes of the search.
+    ``beside`` returns the evidence of poses by the keyframes of the search, after a loss with odometry's prior.
     """
     candidates = [leader]
     for angle in 2.0 * np.pi * np.arange(_DIRECTIONS) / _DIRECTIONS:
@@ -137,4 +148,5 @@ def find_modes(
             modes.append(k)
     weights = np.exp(ratios[modes] - ratios[modes[0]])
     metres = [gap(k, modes[0])[0] for k in modes]
-    return Modes(candidates[modes[0]], np.array(metres), weights / weights.sum())
+    places = [candidates[k] for k in modes]
+    return Modes(places[0], np.array(metres), weights / weights.sum(), places)

@@ -101,6 +101,9 @@ def test_modes_of_a_place_have_the_prior_of_the_path(request_):
             assert abs(by_path[0] - by_path[1]) < 0.1
         else:
             assert by_path[ahead] - by_path[1 - ahead] > 5.0  # more than a moved building may seem to fit better
+        request = lost(request_, metres, 1e-3, sigma)
+        grown = LostPlace(pose_from(np.eye(3), [9.0, 0.0, 0.0]) @ T_MAP_ODOM, 0.1 * request.lost.covariance, 1e-3)
+        assert np.isfinite(log_priors(modes, leader, request, LocalizerConfig(), scorer, grown)).all()
 
 
 def test_drift_has_to_explain_the_distance_at_the_first_keyframe(world_map, world_drive, request_):

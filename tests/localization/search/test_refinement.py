@@ -121,4 +121,8 @@ def test_only_modes_within_the_place_count(row_map, points, monkeypatch):
     ],
 )
 def test_modes_elsewhere_count_together(distances, probabilities, undecided):
-    assert Modes(candidate(place(1.0)), np.array(distances), np.array(probabilities)).undecided == undecided
+    places = [candidate(place(1.0)) for _ in distances]
+    modes = Modes(places[0], np.array(distances), np.array(probabilities), places)
+    assert modes.undecided == undecided
+    odds = [p / probabilities[0] for p, metres in zip(probabilities, distances, strict=True) if metres > 0.5]
+    assert [each.probability for each in modes.distant] == pytest.approx(odds)
