@@ -183,8 +183,8 @@ def test_missing_viewer_library_is_named(monkeypatch, capsys):
     assert "--rerun: rerun is not installed; " in capsys.readouterr().err
 
 
-@pytest.mark.usefixtures("cache")
-def test_map_is_asked_for_where_the_network_options_say(refused):
+def test_map_is_asked_for_where_the_network_options_say(refused, tmp_path, monkeypatch):
+    monkeypatch.setenv("COVIEW_CACHE", str(tmp_path))
     endpoint = free_endpoint()
     assert f"zenoh://yard ({endpoint})" in refused("watch", "--connect", endpoint, "--map", "zenoh://yard")
 
