@@ -9,7 +9,6 @@ import argparse
 import contextlib
 import json
 import queue
-import shutil
 import signal
 import socket
 import subprocess
@@ -86,7 +85,7 @@ def run(args: argparse.Namespace) -> int:
         print(f"{'reason':<18} {located.reason}")
     if located.dropped:
         print(f"{'busy':<18} {located.dropped}; odometry carries the pose over some; try demo --offline")
-    command = "coview-stream" if shutil.which("coview-stream") else sys.argv[0]  # outside its environment
+    command = sys.argv[0] if Path(sys.argv[0]).stem == "coview-stream" else "coview-stream"
     names = ("site.coview", "world", *([] if args.offline else ["logs"]), *_WRITTEN)
     print(f"{'written':<18} {out}: {', '.join(name for name in names if (out / name).exists())}")
     print(f"{'step by step':<18} {command} build {world / 'base.laz'} -o site.coview")
