@@ -84,10 +84,10 @@ class _Path(NamedTuple):
     """Comparison of P places with odometry's path; densities in the unit of :func:`_by_drift`."""
 
     gaps: Floats  # (P, 6) from the path's newest end
-    squared: Floats  # (P,) distances in units of the drift, squared
+    squared: Floats  # (P,) distances in units of the drift and of its growth since the first keyframe, squared
     there: Floats  # (P,) density of the drift at no gap
     density: Floats  # (P,) of the drift
-    prior: Floats  # (P,) density of the drift or a slip
+    prior: Floats  # (P,) density of the drift or a slip, not normalised
 
 
 def _by_path(

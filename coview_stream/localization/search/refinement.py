@@ -2,7 +2,7 @@
 
 A place comprises all poses within two metres of its best pose. Registration converges to the nearest fitting pose;
 where the scan shows little, or the site has changed, that may be a metre off. So registration also starts from poses
-all around, and the results are weighted by the evidence of all keyframes, like places.
+all around, and the results are weighted by the evidence of all keyframes, like places, and after a loss by odometry.
 """
 
 from __future__ import annotations
@@ -44,7 +44,7 @@ _DIRECTIONS = 8  # of the other starts from the leader
 _SAME_METRES, _SAME_RADIANS = 0.3, np.radians(2.0)  # closer poses are one mode
 
 Beside = Callable[[Floats], Floats]
-"""Returns the evidence of poses beside a place: :meth:`PlaceScorer.beside`."""
+"""Returns log-evidence (M,) of poses (M, 4, 4) beside a place, as :meth:`PlaceScorer.beside`, and any log-prior."""
 
 
 @dataclass(frozen=True)
