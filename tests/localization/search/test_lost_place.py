@@ -106,6 +106,17 @@ def test_modes_of_a_place_have_the_prior_of_the_path(request_):
         assert np.isfinite(log_priors(modes, leader, request, LocalizerConfig(), scorer, grown)).all()
 
 
+def test_mode_nearer_to_the_path_has_more_prior(request_):
+    """Also where drift hardly explains the farther one: no mode is compared by another rule than the next."""
+    shifts = np.arange(0.0, 2.1, 0.1)
+    modes = np.stack([pose_from(np.eye(3), [-metres, 0.0, 0.0]) @ T_MAP_ODOM for metres in shifts])
+    leader = candidate(place(0.9, T_MAP_ODOM))
+    for sigma, slipped in ((0.1, 1e-3), (0.3, 1e-3), (0.3, 1e-5)):  # not grown since the first keyframe
+        request, begin = lost(request_, 0.0, 1e-3, sigma), lost(request_, 0.0, slipped, sigma).lost
+        by_path = log_priors(modes, leader, request, LocalizerConfig(), Silent(request_), begin)
+        assert (np.diff(by_path) <= 0.0).all()
+
+
 def test_drift_has_to_explain_the_distance_at_the_first_keyframe(world_map, world_drive, request_):
     """Where odometry led away from the search's places at once, it did not drift there on the way since."""
     request = lost(request_, 1.5, 1e-3, sigma=1.0)
