@@ -77,7 +77,7 @@ def log_priors(
     if request.lost is None or leader.registration is None:
         return np.zeros(len(T_map_odom))
     registered = registration_covariance(leader.registration.information, config.registration)
-    return np.log(_by_path(T_map_odom, registered, request, request.lost, config, scorer, begin).prior)
+    return np.log(_by_path(T_map_odom, registered, request, request.lost, config, scorer, begin, one_place=True).prior)
 
 
 class _Path(NamedTuple):
@@ -92,32 +92,33 @@ class _Path(NamedTuple):
 
 def _by_path(
     at: Poses, registered: Floats, request: SearchRequest, lost: LostPlace, config: LocalizerConfig,
-    scorer: PlaceScorer, begin: LostPlace | None,
+    scorer: PlaceScorer, begin: LostPlace | None, *, one_place: bool = False,
 ) -> _Path:  # fmt: skip
     """Compare places (P, 4, 4) with odometry's path; ``registered`` (6, 6) is the covariance of a registered pose.
 
-    Places are compared at the first keyframe, where ``begin`` is the lost place, and by the growth of their gaps since;
-    without ``begin`` at the newest.
+    Places within the drift are compared at the first keyframe, where ``begin`` is the lost place, and by the growth of
+    their gaps since; the others at the newest, as all are without ``begin``. Poses of ``one_place`` are all compared at
+    the same keyframe, else a mode beyond the drift might have more prior than a nearer one.
     """
     end = lost.T_map_odom @ request.T_odom_body
     gaps = np.array([boxminus(end, T @ request.T_odom_body) for T in at])
     spread = lost.covariance + registered + np.diag([0.0, 0.0, 0.0, 0.0, 0.0, _HEIGHT**2])
-    if begin is None:
-        there, distance = _by_drift(gaps, spread)
-        density = there * np.exp(-0.5 * distance)
-        return _Path(gaps, distance, there, density, density + lost.odds)
-    T_odom_first, path = scorer.look_back(at)
-    gap = (begin.T_map_odom @ T_odom_first)[:2, 3] - path[:, :2]
-    scatter = registered[3:5, 3:5] + SCATTER**2 * np.eye(2)
-    size, axes = np.linalg.eigh((lost.covariance - begin.covariance)[3:5, 3:5])  # a way back unwinds drift
-    grown = scatter + (axes * np.maximum(size, 0.0)) @ axes.T
-    later = gaps[:, 3:5] - gap
-    since = np.minimum(np.einsum("ki,ki->k", later, np.linalg.solve(grown, later.T).T), _FAR)
-    first = gaps.copy()
-    spread[3:5], spread[:, 3:5], first[:, 3:5] = 0.0, 0.0, gap
-    spread[3:5, 3:5] = begin.covariance[3:5, 3:5] + scatter
-    there, distance = _by_drift(first, spread)
-    slipped = min(begin.odds, lost.odds)  # by the first keyframe
+    there, distance = _by_drift(gaps, spread)
+    near, since = distance <= chi2_quantile(len(_LEVEL), config.acceptance.risk), np.zeros(len(at))
+    near |= one_place and near.any()
+    slipped = lost.odds if begin is None else min(begin.odds, lost.odds)  # by the first keyframe
+    if begin is not None and near.any():
+        T_odom_first, path = scorer.look_back(at[near])
+        gap = (begin.T_map_odom @ T_odom_first)[:2, 3] - path[:, :2]
+        scatter = registered[3:5, 3:5] + SCATTER**2 * np.eye(2)
+        size, axes = np.linalg.eigh((lost.covariance - begin.covariance)[3:5, 3:5])  # a way back unwinds drift
+        grown = scatter + (axes * np.maximum(size, 0.0)) @ axes.T
+        later = gaps[near, 3:5] - gap
+        since[near] = np.minimum(np.einsum("ki,ki->k", later, np.linalg.solve(grown, later.T).T), _FAR)
+        first = gaps[near]
+        spread[3:5], spread[:, 3:5], first[:, 3:5] = 0.0, 0.0, gap
+        spread[3:5, 3:5] = begin.covariance[3:5, 3:5] + scatter
+        there[near], distance[near] = _by_drift(first, spread)
     along = np.exp(-0.5 * since)
     density = along * there * np.exp(-0.5 * distance)
     return _Path(gaps, distance + since, there, density, density + along * slipped + (lost.odds - slipped))
