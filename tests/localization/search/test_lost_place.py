@@ -78,7 +78,7 @@ def test_path_confirms_no_other_heading_or_storey_but_the_place_at_its_end(world
 
 def test_path_that_leads_beside_it_contradicts_it_unless_odometry_went_wrong(world_map, request_):
     for metres, odds, state in (
-        (1.5, 1e-3, State.AMBIGUOUS), (1.5, 1e4, State.TRACKING),
+        (1.5, 1e-3, State.AMBIGUOUS), (1.5, 1e4, State.TRACKING), (1.2, 1e4, State.TRACKING),
         (25.0, 1e-2, State.TRACKING),  # no part moves so far
     ):  # fmt: skip
         result = searching(world_map).update(lost(request_, metres, odds))
